@@ -1,0 +1,623 @@
+"""Refractive bundle adjustment: chunks of eliminated tracks as Ceres residual blocks.
+
+A chunk's reduced cost `f`, gradient `g` and Gauss-Newton matrix `H = U^T U` (Cholesky) reach Ceres as one
+residual block with residual `[U^-T g; sqrt(2 f - |U^-T g|^2)]` and Jacobian `[U; 0]`: the same cost, the same
+gradient, the same Gauss-Newton matrix. A trial step needs the cost only, `[0; sqrt(2 f)]`. Ceres keeps the
+trust region, the bounds, the manifolds, further residual blocks (priors) and the report.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+import pyceres
+from numpy.typing import NDArray
+from scipy.linalg import lapack
+from threadpoolctl import threadpool_limits
+
+from colmap_refract import elimination
+from colmap_refract.elimination import LENS, MEDIUM, PLANE, POSE, Anchors, Optics, Tracks
+from colmap_refract.interface import Array, Layers
+from colmap_refract.optics import Media
+from colmap_refract.options import Loss
+from colmap_refract.scenario import Change, State, Structure, apply, evaluate_views
+
+logger = logging.getLogger(__name__)
+
+_LOSSES = {
+    "trivial": elimination.TRIVIAL,
+    "huber": elimination.HUBER,
+    "soft_l1": elimination.SOFT_L1,
+    "cauchy": elimination.CAUCHY,
+}
+
+_JITTER = 1e-12
+"""Of the scaled matrix's unit diagonal: the gauge leaves seven directions without any curvature."""
+
+MAX_CHUNK_COLUMNS = 700
+"""Up to this many unknowns all tracks form one chunk; beyond, Ceres' product of the Jacobian with itself,
+cubic in a chunk's unknowns, is worth splitting for."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Held:
+    """What an adjustment leaves as it is.
+
+    Attributes:
+        poses: (F,) pose blocks.
+        normals, distances: (B,) of the plane blocks.
+        points, index, lens: all of them.
+    """
+
+    poses: NDArray[np.bool_]
+    normals: NDArray[np.bool_]
+    distances: NDArray[np.bool_]
+    points: bool = False
+    index: bool = True
+    lens: bool = True
+
+    @staticmethod
+    def nothing(state: State) -> Held:
+        planes = len(state.normal)
+        return Held(
+            poses=np.zeros(len(state.rotation), bool),
+            normals=np.zeros(planes, bool),
+            distances=np.zeros(planes, bool),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Problem:
+    """A refractive bundle adjustment: data, tying, start and robust loss, in units of the solve."""
+
+    tracks: Tracks
+    structure: Structure
+    layers: Layers
+    state: State
+    points: Array
+    held: Held
+    loss: Loss = "trivial"
+    loss_scale: float = 1.0
+
+    @property
+    def optics(self) -> Optics:
+        """The media at the state's index, for compiled code."""
+        return _optics(self.layers, self.state.index)
+
+
+def _optics(layers: Layers, index: float) -> Optics:
+    media = Media(layers.with_index(index))
+    return Optics(media.ratio, media.ratio_by_index, media.walls)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolverSettings:
+    """How Ceres is run. Tolerances are relative."""
+
+    max_num_iterations: int = 100
+    function_tolerance: float = 1e-9
+    gradient_tolerance: float = 1e-12
+    parameter_tolerance: float = 1e-10
+    initial_trust_region_radius: float = 1e4
+    num_threads: int = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """One iteration of the solver, for whoever watches."""
+
+    iteration: int
+    cost: float
+    rms: float
+    gradient_max_norm: float
+    step_norm: float
+    successful: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Adjustment:
+    """Outcome of `adjust`.
+
+    Attributes:
+        state, points: the solution.
+        cost: sum of the robust losses over 2, in px^2.
+        initial_cost: at the start.
+        num_iterations: of Ceres, rejected steps included.
+        termination: Ceres' word for why it stopped.
+        message: Ceres' reason.
+        gradient_max_norm: largest entry of the gradient at the solution, px^2 per unit of the parameters.
+        seconds: spent in the solver.
+    """
+
+    state: State
+    points: Array
+    cost: float
+    initial_cost: float
+    num_iterations: int
+    termination: Literal["convergence", "no_convergence", "failure"]
+    message: str
+    gradient_max_norm: float
+    seconds: float
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C while Ceres was running; raised once it has let go of the threads."""
+
+
+@dataclass
+class _Blocks:
+    """The parameter blocks given to Ceres: a key (slot, block) and the array Ceres works in."""
+
+    keys: list[tuple[int, int]]
+    values: dict[tuple[int, int], Array]
+
+    def change(self, state: State) -> Change:
+        change = Change.zero(state)
+        index = 0.0
+        for (slot, block), value in self.values.items():
+            if slot == POSE:
+                change.pose[block] = value
+            elif slot == PLANE:
+                change.plane[block] = value
+            elif slot == MEDIUM:
+                index = float(value[0])
+            else:
+                change.lens[block] = value
+        return replace(change, index=index)
+
+
+def _slot_width(slot: int, state: State) -> int:
+    return (6, 3, 1, state.lens.shape[1])[slot]
+
+
+def _image_blocks(problem: Problem, image: int) -> list[tuple[int, int]]:
+    """The free blocks that an image depends on, as (slot, block)."""
+    held, structure = problem.held, problem.structure
+    blocks = []
+    pose, plane = int(structure.image_pose[image]), int(structure.image_plane[image])
+    if not held.poses[pose]:
+        blocks.append((POSE, pose))
+    if plane >= 0 and not (held.normals[plane] and held.distances[plane]):
+        blocks.append((PLANE, plane))
+    if plane >= 0 and not held.index:
+        blocks.append((MEDIUM, 0))
+    if not held.lens:
+        blocks.append((LENS, int(structure.image_camera[image])))
+    return blocks
+
+
+def _local(indices: NDArray[np.int64], used: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Positions of `indices` in the sorted array `used`; -1 stays -1."""
+    return np.where(indices < 0, -1, np.searchsorted(used, np.maximum(indices, 0)))
+
+
+class Chunk:
+    """A range of tracks with just the images that see them, and the reduced system they give."""
+
+    def __init__(self, problem: Problem, point_indices: NDArray[np.int64], num_slices: int) -> None:
+        tracks, structure = problem.tracks, problem.structure
+        lengths = np.diff(tracks.start)[point_indices]
+        start = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
+        take = np.arange(start[-1]) + np.repeat(tracks.start[point_indices] - start[:-1], lengths)
+        images = np.unique(tracks.image[take]).astype(np.int64)
+        self.point_indices = point_indices
+        self.tracks = Tracks(
+            start=start,
+            image=_local(tracks.image[take].astype(np.int64), images).astype(np.int32),
+            direction=np.ascontiguousarray(tracks.direction[take]),
+            metric=np.ascontiguousarray(tracks.metric[take]),
+            lens=np.ascontiguousarray(tracks.lens[take]),
+            wet=tracks.wet[take],
+        )
+        poses = np.unique(structure.image_pose[images])
+        planes = np.unique(structure.image_plane[images])
+        planes = planes[planes >= 0]
+        cameras = np.unique(structure.image_camera[images])
+        self.structure = Structure(
+            image_pose=_local(structure.image_pose[images], poses),
+            image_plane=_local(structure.image_plane[images], planes),
+            image_camera=_local(structure.image_camera[images], cameras),
+            sensor_rotation=structure.sensor_rotation[images],
+            sensor_translation=structure.sensor_translation[images],
+            plane_in_world=structure.plane_in_world[planes],
+            plane_anchor=structure.plane_anchor[planes],
+        )
+        state = problem.state
+        self.state = State(
+            rotation=state.rotation[poses],
+            translation=state.translation[poses],
+            normal=state.normal[planes],
+            distance=state.distance[planes],
+            index=state.index,
+            lens=state.lens[cameras],
+        )
+        self.keys: list[tuple[int, int]] = sorted({key for i in images for key in _image_blocks(problem, int(i))})
+        self.widths = [_slot_width(slot, state) for slot, _ in self.keys]
+        self.first_column = dict(zip(self.keys, np.concatenate([[0], np.cumsum(self.widths)]).tolist(), strict=False))
+        self.num_columns = int(sum(self.widths))
+        self.columns = np.full((len(images), 4), -1, dtype=np.int32)
+        for row, image in enumerate(images):
+            for key in _image_blocks(problem, int(image)):
+                self.columns[row, key[0]] = self.first_column[key]
+        self._place = {POSE: poses, PLANE: planes, MEDIUM: np.zeros(1, np.int64), LENS: cameras}
+        self._problem = problem
+        self._loss = (_LOSSES[problem.loss], problem.loss_scale)
+        self.points = np.ascontiguousarray(problem.points[point_indices])
+        self.anchors = Anchors(weight=np.zeros(len(point_indices)), position=self.points.copy())
+        # Slices of about equally many observations, for threads within the chunk.
+        bounds = np.searchsorted(start, np.linspace(0, start[-1], num_slices + 1)[1:-1])
+        edges = np.concatenate([[0], bounds, [len(point_indices)]]).astype(int)
+        self._slices = [(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True) if b > a]
+        # Where the points were last settled: Ceres linearises where it has just tried.
+        self._trial: tuple[Array, Array, float] | None = None
+
+    def views(self, parameters: Sequence[Array]) -> tuple[elimination.Views, Optics] | None:
+        """The images at Ceres' parameter values; None where a plane would lie behind its camera."""
+        change = Change.zero(self.state)
+        index = 0.0
+        for (slot, block), value in zip(self.keys, parameters, strict=True):
+            at = int(np.searchsorted(self._place[slot], block))
+            if slot == POSE:
+                change.pose[at] = value
+            elif slot == PLANE:
+                change.plane[at] = value
+            elif slot == MEDIUM:
+                index = float(value[0])
+            else:
+                change.lens[at] = value
+        change = replace(change, index=index)
+        if not all(np.isfinite(a).all() for a in (change.pose, change.plane, change.lens)):
+            return None
+        views = evaluate_views(self.structure, self.state, change, self.columns)
+        if not (views.distance > 0.0).all() or self.state.index + index <= 0.0:
+            return None
+        return views, _optics(self._problem.layers, self.state.index + index)
+
+    def _run(self, pool: ThreadPoolExecutor | None, job: Callable[[int, int, int], Any]) -> list[Any]:
+        if pool is None or len(self._slices) == 1:
+            return [job(n, a, b) for n, (a, b) in enumerate(self._slices)]
+        futures = [pool.submit(job, n, a, b) for n, (a, b) in enumerate(self._slices)]
+        return [future.result() for future in futures]
+
+    def settle(self, parameters: Sequence[Array], pool: ThreadPoolExecutor | None) -> tuple[Array, float] | None:
+        """Points at their minima for the given parameters, and the cost there."""
+        state = self.views(parameters)
+        if state is None:
+            return None
+        views, optics = state
+        points = self.points.copy()
+        if self._problem.held.points:
+            out = np.empty((len(self.tracks.image), 2))
+            elimination.residuals(points, self.tracks, views, optics, out)
+            cost = 0.5 * float(robust_cost((out**2).sum(axis=1), self._problem.loss, self._problem.loss_scale).sum())
+        else:
+            cost = sum(
+                self._run(
+                    pool,
+                    lambda _, a, b: elimination.settle(
+                        points, self.anchors, a, b, self.tracks, views, optics, *self._loss
+                    ),
+                )
+            )
+        if not np.isfinite(cost):
+            return None
+        self._trial = (np.concatenate([np.zeros(0), *parameters]), points, cost)
+        return points, cost
+
+    def reduce(self, parameters: Sequence[Array], pool: ThreadPoolExecutor | None) -> tuple[float, Array, Array] | None:
+        """Cost, gradient (n,) and Gauss-Newton matrix (n, n; upper triangle) at the given parameters."""
+        at = np.concatenate([np.zeros(0), *parameters])
+        if self._trial is None or not np.array_equal(self._trial[0], at):
+            if self.settle(parameters, pool) is None:
+                return None
+            assert self._trial is not None
+        state = self.views(parameters)
+        assert state is not None
+        views, optics = state
+        self.points = self._trial[1]
+        n = self.num_columns
+        matrices = [np.zeros((n, n)) for _ in self._slices]
+        gradients = [np.zeros(n) for _ in self._slices]
+        costs = self._run(
+            pool,
+            lambda k, a, b: elimination.reduce(
+                self.points, self._problem.held.points, self.anchors, a, b, self.tracks, views, optics,
+                *self._loss, matrices[k], gradients[k],
+            ),
+        )  # fmt: skip
+        for matrix, gradient in zip(matrices[1:], gradients[1:], strict=True):
+            matrices[0] += matrix
+            gradients[0] += gradient
+        return sum(costs), gradients[0], matrices[0]
+
+
+def robust_cost(squared: Array, loss: Loss, scale: float) -> Array:
+    """`rho` of squared residuals in px^2, as Ceres defines the losses."""
+    b = scale * scale
+    if loss == "huber":
+        return np.where(squared <= b, squared, 2.0 * scale * np.sqrt(squared) - b)
+    if loss == "soft_l1":
+        return 2.0 * b * (np.sqrt(1.0 + squared / b) - 1.0)
+    if loss == "cauchy":
+        return np.asarray(b * np.log1p(squared / b))
+    return squared
+
+
+def square_root(matrix: Array) -> Array:
+    """Upper Cholesky factor of a positive semi-definite matrix given by its upper triangle.
+
+    The matrix is scaled by its diagonal first, and a jitter relative to that makes the gauge's null
+    space harmless. A parameter without any curvature gets a row of its own.
+    """
+    diagonal = np.diag(matrix).copy()
+    top = diagonal.max(initial=0.0)
+    diagonal[diagonal <= 1e-300 + 1e-30 * top] = 1.0
+    scale = 1.0 / np.sqrt(diagonal)
+    scaled = matrix * scale * scale[:, None]
+    jitter = _JITTER
+    while True:
+        trial = scaled.copy()
+        trial[np.diag_indices_from(trial)] = np.maximum(np.diag(scaled), 0.0) + jitter
+        # A C-ordered upper triangle is LAPACK's lower one, which spares it a transposing copy.
+        factor, info = lapack.dpotrf(trial.T, lower=1, clean=1, overwrite_a=1)
+        if info == 0:
+            break
+        jitter *= 100.0
+        if jitter > 1.0:
+            raise FloatingPointError("the reduced system is not finite")
+    return np.asarray(factor.T / scale)
+
+
+class _ReducedCost(pyceres.CostFunction):  # type: ignore[misc]
+    """One chunk as Ceres sees it."""
+
+    def __init__(self, chunk: Chunk, pool: ThreadPoolExecutor | None, watch: _Watch) -> None:
+        super().__init__()
+        self.chunk = chunk
+        self.pool = pool
+        self.watch = watch
+        self.set_num_residuals(chunk.num_columns + 1)
+        self.set_parameter_block_sizes(chunk.widths)
+
+    def Evaluate(self, parameters: list[Array], residuals: Array, jacobians: list[Array | None] | None) -> bool:
+        # An exception must not travel through Ceres' threads: keep it, fail, and raise it afterwards.
+        if self.watch.exception is not None:
+            return False
+        try:
+            return self._evaluate(parameters, residuals, jacobians)
+        except BaseException as exception:
+            self.watch.exception = exception
+            return False
+
+    def _evaluate(self, parameters: list[Array], residuals: Array, jacobians: list[Array | None] | None) -> bool:
+        if jacobians is None:
+            settled = self.chunk.settle(parameters, self.pool)
+            if settled is None:
+                return False
+            residuals[:-1] = 0.0
+            residuals[-1] = np.sqrt(2.0 * max(settled[1], 0.0))
+            return True
+        reduced = self.chunk.reduce(parameters, self.pool)
+        if reduced is None or not (np.isfinite(reduced[0]) and np.isfinite(reduced[1]).all()):
+            return False
+        cost, gradient, matrix = reduced
+        factor = square_root(matrix)
+        head, _ = lapack.dtrtrs(factor.T, gradient, lower=1)
+        residuals[:-1] = head
+        residuals[-1] = np.sqrt(max(2.0 * cost - head @ head, 0.0))
+        n = self.chunk.num_columns
+        for key, width, jacobian in zip(self.chunk.keys, self.chunk.widths, jacobians, strict=True):
+            if jacobian is None:
+                continue
+            first = self.chunk.first_column[key]
+            block = jacobian.reshape(n + 1, width)
+            block[:n] = factor[:, first : first + width]
+            block[n] = 0.0
+        return True
+
+
+@dataclass
+class _Watch:
+    """What happens during a solve: the exception to raise afterwards, and the last gradient."""
+
+    on_progress: Callable[[Progress], None] | None
+    num_observations: int
+    exception: BaseException | None = None
+    last: Any = None
+    gradient_max_norm: float = float("nan")
+    iterations: int = 0
+    history: list[float] = field(default_factory=list)
+
+
+class _Callback(pyceres.IterationCallback):  # type: ignore[misc]
+    def __init__(self, watch: _Watch) -> None:
+        super().__init__()
+        self.watch = watch
+
+    def __call__(self, summary: Any) -> Any:
+        watch = self.watch
+        if watch.exception is not None:
+            return pyceres.CallbackReturnType.SOLVER_ABORT
+        try:
+            watch.gradient_max_norm = float(summary.gradient_max_norm)
+            if watch.on_progress is not None:
+                watch.on_progress(
+                    Progress(
+                        iteration=int(summary.iteration),
+                        cost=float(summary.cost),
+                        rms=float(np.sqrt(2.0 * summary.cost / max(watch.num_observations, 1))),
+                        gradient_max_norm=float(summary.gradient_max_norm),
+                        step_norm=float(summary.step_norm),
+                        successful=bool(summary.step_is_successful),
+                    )
+                )
+        except BaseException as exception:
+            watch.exception = exception
+            return pyceres.CallbackReturnType.SOLVER_ABORT
+        return pyceres.CallbackReturnType.SOLVER_CONTINUE
+
+
+def split(problem: Problem, num_threads: int) -> list[Chunk]:
+    """Cut the tracks into chunks that touch few images each.
+
+    Points are halved along the widest axis of where their observers stand until a chunk's images have at
+    most `MAX_CHUNK_COLUMNS` unknowns (or it has few points left).
+    """
+    tracks, structure = problem.tracks, problem.structure
+    num_points = len(tracks.start) - 1
+    rotation, translation = problem.state.cam_from_world(structure)
+    centers = -np.einsum("nji,nj->ni", rotation, translation)
+    lengths = np.diff(tracks.start)
+    observer = np.add.reduceat(centers[tracks.image], tracks.start[:-1], axis=0) / lengths[:, None]
+    own = np.array([sum(_slot_width(s, problem.state) for s, _ in _image_blocks(problem, i) if s != MEDIUM)
+                    for i in range(structure.num_images)])  # fmt: skip
+    parts: list[NDArray[np.int64]] = []
+    pending = [np.arange(num_points)]
+    total = sum(_slot_width(s, problem.state) for s, _ in {k for i in range(structure.num_images)
+                                                           for k in _image_blocks(problem, i)})  # fmt: skip
+    while pending:
+        part = pending.pop()
+        if total > MAX_CHUNK_COLUMNS and len(part) > 200:
+            rows = np.repeat(tracks.start[part], lengths[part])
+            offsets = np.arange(len(rows)) - np.repeat(np.cumsum(lengths[part]) - lengths[part], lengths[part])
+            touched = np.unique(tracks.image[rows + offsets])
+            spread = np.ptp(observer[part], axis=0)
+            if own[touched].sum() > MAX_CHUNK_COLUMNS / 2 and spread.max() > 0:
+                order = np.argsort(observer[part, int(spread.argmax())], kind="stable")
+                pending += [part[order[: len(part) // 2]], part[order[len(part) // 2 :]]]
+                continue
+        parts.append(np.sort(part))
+    num_slices = num_threads if len(parts) < num_threads else 1
+    return [Chunk(problem, part, num_slices) for part in parts]
+
+
+def adjust(
+    problem: Problem,
+    settings: SolverSettings,
+    *,
+    anchor_weights: Array | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
+) -> Adjustment:
+    """Minimise the refractive reprojection error from the problem's start.
+
+    Args:
+        problem: what to solve.
+        settings: of Ceres.
+        anchor_weights: (P,) weights of the proximal terms that keep each point near its start.
+        on_progress: called after every iteration, on the calling thread.
+
+    Returns:
+        The solution; check `termination`.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C during the solve, once Ceres has stopped.
+        FloatingPointError: the reduced system is not finite.
+    """
+    chunks = split(problem, settings.num_threads)
+    if anchor_weights is not None:
+        for chunk in chunks:
+            chunk.anchors = Anchors(anchor_weights[chunk.point_indices], chunk.points.copy())
+    keys = sorted({key for chunk in chunks for key in chunk.keys})
+    blocks = _Blocks(keys, {key: np.zeros(_slot_width(key[0], problem.state)) for key in keys})
+    watch = _Watch(on_progress, len(problem.tracks.image))
+    num_slices = max((len(chunk._slices) for chunk in chunks), default=1)
+    pool = ThreadPoolExecutor(num_slices) if num_slices > 1 else None
+    try:
+        return _solve(problem, settings, chunks, blocks, watch, pool)
+    finally:
+        if pool is not None:
+            pool.shutdown()
+
+
+def _solve(
+    problem: Problem,
+    settings: SolverSettings,
+    chunks: list[Chunk],
+    blocks: _Blocks,
+    watch: _Watch,
+    pool: ThreadPoolExecutor | None,
+) -> Adjustment:
+    ceres = pyceres.Problem()
+    costs = [_ReducedCost(chunk, pool, watch) for chunk in chunks]
+    if not blocks.keys:
+        # Nothing on the camera side is free: the points alone are settled.
+        settled = [chunk.settle([], pool) for chunk in chunks]
+        cost = sum(s[1] if s else np.nan for s in settled)
+        return Adjustment(
+            state=problem.state, points=_settled(problem, chunks, blocks, pool), cost=cost, initial_cost=cost,
+            num_iterations=0, termination="convergence" if np.isfinite(cost) else "failure",
+            message="Only points are free.", gradient_max_norm=0.0, seconds=0.0,
+        )  # fmt: skip
+    for cost in costs:
+        ceres.add_residual_block(cost, None, [blocks.values[key] for key in cost.chunk.keys])
+    for key in blocks.keys:
+        if key[0] != PLANE:
+            continue
+        fixed = ([0, 1] if problem.held.normals[key[1]] else []) + ([2] if problem.held.distances[key[1]] else [])
+        if fixed:
+            ceres.set_manifold(blocks.values[key], pyceres.SubsetManifold(3, fixed))
+    options = pyceres.SolverOptions()
+    options.linear_solver_type = pyceres.LinearSolverType.SPARSE_NORMAL_CHOLESKY
+    if len(chunks) == 1:
+        options.linear_solver_type = pyceres.LinearSolverType.DENSE_NORMAL_CHOLESKY
+    options.max_num_iterations = settings.max_num_iterations
+    options.function_tolerance = settings.function_tolerance
+    options.gradient_tolerance = settings.gradient_tolerance
+    options.parameter_tolerance = settings.parameter_tolerance
+    options.initial_trust_region_radius = settings.initial_trust_region_radius
+    options.max_num_consecutive_invalid_steps = 20
+    options.num_threads = settings.num_threads
+    options.logging_type = pyceres.LoggingType.SILENT
+    callback = _Callback(watch)
+    options.callbacks = [callback]
+    summary = pyceres.SolverSummary()
+    # BLAS threads that wait for one another beside Ceres' own made a Cholesky of 600 unknowns take 1 s, not 5 ms.
+    with threadpool_limits(limits=1, user_api="blas"):
+        pyceres.solve(options, ceres, summary)
+    if watch.exception is not None:
+        raise watch.exception
+    kind = pyceres.TerminationType
+    termination: Literal["convergence", "no_convergence", "failure"] = "failure"
+    if summary.termination_type in (kind.CONVERGENCE, kind.USER_SUCCESS):
+        termination = "convergence"
+    elif summary.termination_type == kind.NO_CONVERGENCE:
+        termination = "no_convergence"
+    return Adjustment(
+        state=apply(problem.state, blocks.change(problem.state)),
+        points=_settled(problem, chunks, blocks, pool),
+        cost=float(summary.final_cost),
+        initial_cost=float(summary.initial_cost),
+        num_iterations=int(summary.num_successful_steps + summary.num_unsuccessful_steps),
+        termination=termination,
+        message=str(summary.message),
+        gradient_max_norm=watch.gradient_max_norm,
+        seconds=float(summary.total_time_in_seconds),
+    )
+
+
+def _settled(problem: Problem, chunks: list[Chunk], blocks: _Blocks, pool: ThreadPoolExecutor | None) -> Array:
+    """All points (P, 3) at their minima for the final parameters."""
+    points = problem.points.copy()
+    for chunk in chunks:
+        settled = chunk.settle([blocks.values[key] for key in chunk.keys], pool)
+        if settled is not None:
+            points[chunk.point_indices] = settled[0]
+    return points
+
+
+def settle_points(problem: Problem, settings: SolverSettings) -> Array:
+    """Points (P, 3) at their minima, with everything on the camera side as it is."""
+    held = replace(
+        problem.held,
+        poses=np.ones_like(problem.held.poses),
+        normals=np.ones_like(problem.held.normals),
+        distances=np.ones_like(problem.held.distances),
+        index=True,
+        lens=True,
+    )
+    return adjust(replace(problem, held=held), settings).points

@@ -1,0 +1,154 @@
+"""What is badly determined here, what looks wrong, and what the user could do about it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from colmap_refract.adjustment import Adjustment, Problem
+from colmap_refract.arrangement import Arrangement
+from colmap_refract.interface import Array
+from colmap_refract.uncertainty import Uncertainty
+
+_NORMAL_LIMIT_DEG = 2.0
+_DISTANCE_LIMIT = 0.1
+_CORRELATION_LIMIT = 0.95
+_DECREMENT_LIMIT = 1e-4
+_NARROW_VIEW_DEG = 20.0
+_OBLIQUE_DEG = 8.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Facts:
+    """What is known after a solve; errors in px, noise in px of one coordinate."""
+
+    arrangement: Arrangement
+    problem: Problem
+    adjustment: Adjustment
+    uncertainty: Uncertainty
+    noise: float
+    pinhole_errors: Array
+    errors: Array
+
+
+def advise(facts: Facts) -> list[str]:
+    """Sentences for the user, the gravest first; none where all is well."""
+    return [*_solver(facts), *_intrinsics(facts), *_planes(facts), *_index(facts), *_water(facts)]
+
+
+def _solver(facts: Facts) -> list[str]:
+    adjustment = facts.adjustment
+    if adjustment.termination != "convergence":
+        return [
+            f"The solver did not converge ({adjustment.message.strip()}): do not trust the result; allow more "
+            "--BundleAdjustment.max_num_iterations."
+        ]
+    if facts.uncertainty.decrement > _DECREMENT_LIMIT:
+        return [
+            f"The solver stopped although {100 * facts.uncertainty.decrement:.2g} % of the cost could still be gained: "
+            "lower --BundleAdjustment.function_tolerance."
+        ]
+    return []
+
+
+def _intrinsics(facts: Facts) -> list[str]:
+    if facts.arrangement.options.cameras or not facts.problem.held.lens:
+        return []
+    sentences = []
+    suspicious = []
+    for camera_id, camera in zip(
+        facts.arrangement.observations.camera_ids, facts.arrangement.observations.cameras, strict=True
+    ):
+        if not len(camera.focal_length_idxs()):
+            continue
+        center = np.array([camera.principal_point_x, camera.principal_point_y])
+        centered = np.abs(center - [camera.width / 2, camera.height / 2]).max() < 1e-6
+        extra = [camera.params[i] for i in camera.extra_params_idxs()]
+        focal = camera.mean_focal_length()
+        # COLMAP refines focal length and distortion and leaves the principal point in the middle.
+        if centered and any(abs(p) > 1e-9 for p in extra) and abs(focal - round(focal)) > 1e-6:
+            suspicious.append(str(camera_id))
+    if suspicious:
+        sentences.append(
+            f"The intrinsics of camera {', '.join(suspicious)} look as if COLMAP had refined them on these images: they have "
+            "then absorbed part of the refraction, and the result is wrong; give intrinsics calibrated in air "
+            "(--camera_path)."
+        )
+    pinhole = facts.pinhole_errors[np.isfinite(facts.pinhole_errors)]
+    if len(pinhole) and facts.arrangement.options.scenario != "fixed_camera":
+        if np.median(pinhole) < 1.05 * np.median(facts.errors):
+            sentences.append(
+                f"Without refraction the model fits as well (median {np.median(pinhole):.3g} px against "
+                f"{np.median(facts.errors):.3g} px): either nothing is refracted here, or the intrinsics have absorbed "
+                "it; give intrinsics calibrated in air (--camera_path) and check --scenario."
+            )
+    return sentences
+
+
+def _planes(facts: Facts) -> list[str]:
+    problem, uncertainty = facts.problem, facts.uncertainty
+    if not uncertainty.determined and not (problem.held.normals.all() and problem.held.distances.all()):
+        return [
+            "The data do not determine all unknowns (the reduced system is singular): hold --interface_normal and "
+            "--interface_distance, or tie images by --interface_group_path."
+        ]
+    normal_deg = np.degrees(uncertainty.normal) * facts.noise
+    relative = uncertainty.distance * facts.noise / np.maximum(np.abs(problem.state.distance), 1e-12)
+    loose_normal = np.flatnonzero(normal_deg > _NORMAL_LIMIT_DEG)
+    loose_distance = np.flatnonzero(relative > _DISTANCE_LIMIT)
+    sentences = []
+    if len(loose_normal):
+        sentences.append(
+            f"The normal of {_how_many(loose_normal, problem)} is uncertain by up to {np.nanmax(normal_deg):.2g} deg: "
+            f"{_remedy(facts)}."
+        )
+    if len(loose_distance):
+        sentences.append(
+            f"The distance of {_how_many(loose_distance, problem)} is uncertain by up to {100 * np.nanmax(relative):.2g} %: "
+            f"{_remedy(facts)}; a known distance helps (--interface_distance, --refine_interface_distance 0)."
+        )
+    return sentences
+
+
+def _how_many(loose: Array, problem: Problem) -> str:
+    total = problem.structure.num_planes
+    return "the interface" if total == 1 else f"{len(loose)} of {total} interfaces"
+
+
+def _remedy(facts: Facts) -> str:
+    """What would help most, from how the scene was photographed."""
+    observations = facts.arrangement.observations
+    axis = observations.direction[:, 2]
+    view = 2.0 * np.degrees(np.arccos(np.clip(np.quantile(axis, 0.05), -1.0, 1.0)))
+    normal, _ = facts.problem.state.planes_in_cam(facts.problem.structure)
+    tilt = np.degrees(np.arccos(np.clip(normal[:, 2], -1.0, 1.0)))
+    per_image = np.bincount(observations.image, minlength=len(observations.image_ids))
+    if view < _NARROW_VIEW_DEG:
+        return f"the view is narrow ({view:.0f} deg), and refraction shows at its edges; use a shorter lens or obliques"
+    if np.median(per_image) < 50:
+        return f"the images have few points (median {np.median(per_image):.0f}); more keypoints would help"
+    if facts.arrangement.options.scenario != "camera_housing" and np.nanmedian(tilt) < _OBLIQUE_DEG:
+        return "all views are nearly along the normal; add oblique ones"
+    return "more images, with other poses, would help"
+
+
+def _index(facts: Facts) -> list[str]:
+    if facts.problem.held.index:
+        return []
+    sigma, correlation = facts.uncertainty.index * facts.noise, facts.uncertainty.index_correlation
+    if not np.isfinite(sigma) or sigma > 0.005 or correlation > _CORRELATION_LIMIT:
+        return [
+            f"The refractive index {facts.problem.state.index:.4f} (standard deviation {sigma:.2g}, correlation with the "
+            f"interface {correlation:.3f}) cannot be told from the rest: hold it (--refine_refractive_index 0)."
+        ]
+    return []
+
+
+def _water(facts: Facts) -> list[str]:
+    problem = facts.problem
+    refracted = problem.structure.image_plane[problem.tracks.image] >= 0
+    dry = float((~problem.tracks.wet)[refracted].mean()) if refracted.any() else 0.0
+    if dry > 0.5:
+        return [f"{100 * dry:.0f} % of the observations are of points on the dry side of the interface: is that so?"]
+    return []

@@ -1,0 +1,538 @@
+"""Points eliminated in compiled code: a chunk of tracks in, a small system in the camera-side parameters out.
+
+For given cameras and planes each point is brought to its own minimum and removed by its 3x3 Schur complement
+(variable projection, Golub & Pereyra 1973; in bundle adjustment Jeong et al. 2012, Hong et al. 2016). What
+is left is the cost `f`, gradient `g` and Gauss-Newton matrix `H` in the camera-side parameters only.
+
+The kernel knows no scenario and no camera model. An observation is a direction with a pixel metric, and
+depends on the point and on up to four *slots* of its image: the pose (6), the plane (3), the index of the
+medium (1) and the lens (any number). `image_columns` says where each slot's parameters stand in the
+chunk's vector (-1: held), so a scenario is only a choice of who shares which columns (module `scenario`).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from colmap_refract.interface import Array
+from colmap_refract.optics import FAST, slope_derivatives, snell_root
+
+POSE, PLANE, MEDIUM, LENS = range(4)
+"""The slots of an image."""
+
+TRIVIAL, HUBER, SOFT_L1, CAUCHY = range(4)
+"""The robust losses."""
+
+MAX_POINT_STEPS = 10
+"""Half-solved points make the cost no function of the cameras; most points need one or two steps."""
+
+POINT_TOLERANCE = 1e-7
+"""A point is at its minimum when one more step would lower its cost by less than this fraction.
+What such a step would gain is subtracted from the cost, so the error left is of the next order."""
+
+_SQUARED_PIXEL_FLOOR = 1e-14
+_GUARD = 1e-11
+
+
+class Tracks(NamedTuple):
+    """Observations sorted by point. N observations of P points in images indexed from 0.
+
+    Attributes:
+        start: (P + 1,) first observation of each point.
+        image: (N,) index of the image.
+        direction: (N, 3) unit direction of the keypoint in the camera's frame.
+        metric: (N, 2, 3) pixels per change of direction, at the keypoint.
+        lens: (N, 2, Q) pixels per change of the camera's refined intrinsics; Q may be 0.
+        wet: (N,) whether the point lies in the water as seen from this image.
+    """
+
+    start: NDArray[np.int64]
+    image: NDArray[np.int32]
+    direction: Array
+    metric: Array
+    lens: Array
+    wet: NDArray[np.bool_]
+
+
+class Views(NamedTuple):
+    """The state of I images and how their local parameters follow from the blocks of the problem.
+
+    Attributes:
+        rotation: (I, 3, 3), translation: (I, 3): `cam_from_world`.
+        normal: (I, 3) `normal_in_cam`, distance: (I,).
+        in_world: (I,) whether the plane is fixed in the world, so that it moves in the camera with the pose.
+        pose_map: (I, 6, 6) local (rotation, translation) by the pose block: `x_cam` changes by
+            `rotation x x_cam + translation`.
+        plane_map: (I, 4, 3) change of (`normal_in_cam`, `distance`) by the plane block at a fixed pose.
+        lens_change: (I, Q) change of the refined intrinsics since the keypoints were lifted.
+        columns: (I, 4) first column of each slot in the chunk's parameter vector, -1 where it is held.
+    """
+
+    rotation: Array
+    translation: Array
+    normal: Array
+    distance: Array
+    in_world: NDArray[np.bool_]
+    pose_map: Array
+    plane_map: Array
+    lens_change: Array
+    columns: NDArray[np.int32]
+
+
+class Optics(NamedTuple):
+    """`optics.Media` as a tuple that compiled code takes."""
+
+    ratio: Array
+    ratio_by_index: Array
+    walls: Array
+
+
+class Anchors(NamedTuple):
+    """Proximal term `weight / 2 |P - position|^2` of each point: (P,) and (P, 3)."""
+
+    weight: Array
+    position: Array
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", inline="always")
+def _robust(s, loss, scale):
+    """`rho(s)` and `rho'(s)` of a squared residual in pixels, Ceres' definitions."""
+    b = scale * scale
+    if loss == HUBER:
+        if s <= b:
+            return s, 1.0
+        root = math.sqrt(s)
+        return 2.0 * scale * root - b, scale / root
+    if loss == SOFT_L1:
+        root = math.sqrt(1.0 + s / b)
+        return 2.0 * b * (root - 1.0), 1.0 / root
+    if loss == CAUCHY:
+        return b * math.log1p(s / b), 1.0 / (1.0 + s / b)
+    return s, 1.0
+
+
+# Layout of one observation's values in scratch memory.
+_RESIDUAL = 0  # 2
+_BY_POINT = 2  # 2 x 3, by the point in the camera's frame
+_BY_NORMAL = 8  # 2 x 3, by a change of the normal orthogonal to it
+_BY_DISTANCE = 14  # 2
+_BY_INDEX = 16  # 2
+_IN_CAM = 18  # 3, the point in the camera's frame
+_VALUES = 21
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", inline="always")
+def _observe(k, point, tracks, views, optics, with_interface, out):
+    """Residual of observation `k` in pixels and its derivatives, into `out` (see the layout above).
+
+    The derivatives by the interface are left out unless `with_interface`.
+    """
+    i = tracks.image[k]
+    rotation = views.rotation[i]
+    x, y, w = point[0], point[1], point[2]
+    cx = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * w + views.translation[i, 0]
+    cy = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * w + views.translation[i, 1]
+    cz = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * w + views.translation[i, 2]
+    vx, vy, vz = cx, cy, cz
+    nx, ny, nz = views.normal[i, 0], views.normal[i, 1], views.normal[i, 2]
+    px, py, pz = 0.0, 0.0, 0.0
+    z = nx * cx + ny * cy + nz * cz
+    big, big_s, big_z, big_d, big_index = 1.0, 0.0, 0.0, 0.0, 0.0
+    refracted = False
+    if tracks.wet[k] and z > 0.0:
+        px, py, pz = cx - z * nx, cy - z * ny, cz - z * nz
+        s = px * px + py * py + pz * pz
+        d = views.distance[i]
+        g, h = snell_root(z, s, d, optics.ratio, optics.walls)
+        if math.isfinite(g):
+            refracted = True
+            big, big_s, big_z, big_d, big_index = slope_derivatives(
+                g, h, s, d, optics.ratio, optics.ratio_by_index, optics.walls
+            )
+            vx, vy, vz = nx + big * px, ny + big * py, nz + big * pz
+    inverse = 1.0 / math.sqrt(vx * vx + vy * vy + vz * vz)
+    ux, uy, uz = vx * inverse, vy * inverse, vz * inverse
+    dx = ux - tracks.direction[k, 0]
+    dy = uy - tracks.direction[k, 1]
+    dz = uz - tracks.direction[k, 2]
+    for row in range(2):
+        m0, m1, m2 = tracks.metric[k, row, 0], tracks.metric[k, row, 1], tracks.metric[k, row, 2]
+        e = m0 * dx + m1 * dy + m2 * dz
+        for q in range(tracks.lens.shape[2]):
+            e += tracks.lens[k, row, q] * views.lens_change[i, q]
+        out[_RESIDUAL + row] = e
+        # a = d residual / d v, through the normalisation of v.
+        along = m0 * ux + m1 * uy + m2 * uz
+        a0, a1, a2 = (m0 - along * ux) * inverse, (m1 - along * uy) * inverse, (m2 - along * uz) * inverse
+        by_point = _BY_POINT + 3 * row
+        if refracted:
+            ap = a0 * px + a1 * py + a2 * pz
+            an = a0 * nx + a1 * ny + a2 * nz
+            # v = n + G p by X: a G + (a . p) (2 G_s p + G_z n) - G (a . n) n
+            fp = 2.0 * big_s * ap
+            fn = big_z * ap - big * an
+            out[by_point] = big * a0 + fp * px + fn * nx
+            out[by_point + 1] = big * a1 + fp * py + fn * ny
+            out[by_point + 2] = big * a2 + fp * pz + fn * nz
+            if with_interface:
+                # by n: a (1 - G z) + ((a . p) (G_z - 2 z G_s) - G (a . n)) p
+                fa = 1.0 - big * z
+                fp = ap * (big_z - 2.0 * z * big_s) - big * an
+                by_normal = _BY_NORMAL + 3 * row
+                out[by_normal] = fa * a0 + fp * px
+                out[by_normal + 1] = fa * a1 + fp * py
+                out[by_normal + 2] = fa * a2 + fp * pz
+                out[_BY_DISTANCE + row] = ap * big_d
+                out[_BY_INDEX + row] = ap * big_index
+        else:
+            out[by_point] = a0
+            out[by_point + 1] = a1
+            out[by_point + 2] = a2
+            if with_interface:
+                for j in range(3):
+                    out[_BY_NORMAL + 3 * row + j] = 0.0
+                out[_BY_DISTANCE + row] = 0.0
+                out[_BY_INDEX + row] = 0.0
+    out[_IN_CAM], out[_IN_CAM + 1], out[_IN_CAM + 2] = cx, cy, cz
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", inline="always")
+def _by_world_point(row, rotation, values):
+    """A row of the derivative by the point in the world."""
+    a0, a1, a2 = values[_BY_POINT + 3 * row], values[_BY_POINT + 3 * row + 1], values[_BY_POINT + 3 * row + 2]
+    return (
+        a0 * rotation[0, 0] + a1 * rotation[1, 0] + a2 * rotation[2, 0],
+        a0 * rotation[0, 1] + a1 * rotation[1, 1] + a2 * rotation[2, 1],
+        a0 * rotation[0, 2] + a1 * rotation[1, 2] + a2 * rotation[2, 2],
+    )
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _point_system(point, anchor_weight, anchor, first, stop, tracks, views, optics, loss, scale, values, v, gradient):
+    """Cost of one point, its gradient (3,) and its Gauss-Newton matrix `v` (xx, xy, xz, yy, yz, zz)."""
+    cost = 0.0
+    for j in range(6):
+        v[j] = 0.0
+    for j in range(3):
+        gradient[j] = 0.0
+    for k in range(first, stop):
+        _observe(k, point, tracks, views, optics, False, values)
+        e0, e1 = values[_RESIDUAL], values[_RESIDUAL + 1]
+        rho, weight = _robust(e0 * e0 + e1 * e1, loss, scale)
+        cost += 0.5 * rho
+        rotation = views.rotation[tracks.image[k]]
+        for row in range(2):
+            b0, b1, b2 = _by_world_point(row, rotation, values)
+            e = weight * values[_RESIDUAL + row]
+            gradient[0] += e * b0
+            gradient[1] += e * b1
+            gradient[2] += e * b2
+            w0, w1, w2 = weight * b0, weight * b1, weight * b2
+            v[0] += w0 * b0
+            v[1] += w0 * b1
+            v[2] += w0 * b2
+            v[3] += w1 * b1
+            v[4] += w1 * b2
+            v[5] += w2 * b2
+    if anchor_weight > 0.0:
+        for j in range(3):
+            change = point[j] - anchor[j]
+            cost += 0.5 * anchor_weight * change * change
+            gradient[j] += anchor_weight * change
+        v[0] += anchor_weight
+        v[3] += anchor_weight
+        v[5] += anchor_weight
+    return cost
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", inline="always")
+def _factor(v, damping, lower):
+    """Cholesky factor (00, 10, 11, 20, 21, 22) of `v` with its diagonal damped, guarded where it is singular."""
+    guard = _GUARD * (v[0] + v[3] + v[5]) + 1e-300
+    a = math.sqrt(v[0] * (1.0 + damping) + guard)
+    lower[0] = a
+    lower[1] = v[1] / a
+    lower[3] = v[2] / a
+    lower[2] = math.sqrt(max(v[3] * (1.0 + damping) + guard - lower[1] * lower[1], guard))
+    lower[4] = (v[4] - lower[3] * lower[1]) / lower[2]
+    lower[5] = math.sqrt(max(v[5] * (1.0 + damping) + guard - lower[3] * lower[3] - lower[4] * lower[4], guard))
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", inline="always")
+def _forward(lower, b0, b1, b2):
+    """Solve `L y = b`."""
+    y0 = b0 / lower[0]
+    y1 = (b1 - lower[1] * y0) / lower[2]
+    return y0, y1, (b2 - lower[3] * y0 - lower[4] * y1) / lower[5]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _settle_point(point, anchor_weight, anchor, first, stop, tracks, views, optics, loss, scale, scratch):
+    """Bring one point to its minimum for the given views, in place; Levenberg-Marquardt, never uphill.
+
+    Returns:
+        Its cost there, less what one more Newton step would gain.
+    """
+    values, v, gradient, lower = scratch[0], scratch[1], scratch[2], scratch[3]
+    trial, trial_v, trial_gradient = scratch[4], scratch[5], scratch[6]
+    cost = _point_system(point, anchor_weight, anchor, first, stop, tracks, views, optics, loss, scale, values, v, gradient)
+    floor = _SQUARED_PIXEL_FLOOR * (stop - first)
+    damping = 0.0
+    gain = 0.0
+    for _ in range(MAX_POINT_STEPS):
+        _factor(v, damping, lower)
+        y0, y1, y2 = _forward(lower, gradient[0], gradient[1], gradient[2])
+        gain = y0 * y0 + y1 * y1 + y2 * y2
+        if not gain > POINT_TOLERANCE * cost + floor:
+            break
+        s2 = y2 / lower[5]
+        s1 = (y1 - lower[4] * s2) / lower[2]
+        s0 = (y0 - lower[1] * s1 - lower[3] * s2) / lower[0]
+        trial[0], trial[1], trial[2] = point[0] - s0, point[1] - s1, point[2] - s2
+        trial_cost = _point_system(
+            trial, anchor_weight, anchor, first, stop, tracks, views, optics, loss, scale, values, trial_v, trial_gradient
+        )
+        if trial_cost < cost:
+            cost = trial_cost
+            damping *= 0.1 if damping > 1e-6 else 0.0
+            for j in range(3):
+                point[j] = trial[j]
+                gradient[j] = trial_gradient[j]
+            for j in range(6):
+                v[j] = trial_v[j]
+            gain = 0.0
+        else:
+            damping = max(1e-3, 10.0 * damping)
+    return cost - 0.5 * gain if damping == 0.0 else cost
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def settle(points, anchors, first_track, stop_track, tracks, views, optics, loss, scale):
+    """Bring points to their minima for the given views.
+
+    Args:
+        points: (P, 3) world positions, changed in place.
+        anchors: the proximal terms.
+        first_track, stop_track: the range of points to work on.
+        tracks, views, optics: see the tuples.
+        loss, scale: robust loss and its scale in pixels.
+
+    Returns:
+        The summed cost at the minima.
+    """
+    scratch = np.empty((7, _VALUES))
+    total = 0.0
+    for p in range(first_track, stop_track):
+        total += _settle_point(
+            points[p], anchors.weight[p], anchors.position[p], tracks.start[p], tracks.start[p + 1],
+            tracks, views, optics, loss, scale, scratch,
+        )  # fmt: skip
+    return total
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", inline="always")
+def _by_blocks(k, values, tracks, views, widths, out):
+    """The derivative of observation `k` by the blocks of its image, into `out` (4, 2, width)."""
+    i = tracks.image[k]
+    columns = views.columns[i]
+    for row in range(2):
+        j0, j1, j2 = values[_BY_POINT + 3 * row], values[_BY_POINT + 3 * row + 1], values[_BY_POINT + 3 * row + 2]
+        n0, n1, n2 = values[_BY_NORMAL + 3 * row], values[_BY_NORMAL + 3 * row + 1], values[_BY_NORMAL + 3 * row + 2]
+        by_distance = values[_BY_DISTANCE + row]
+        if columns[POSE] >= 0:
+            x, y, z = values[_IN_CAM], values[_IN_CAM + 1], values[_IN_CAM + 2]
+            # Local rotation: x_cam changes by omega x x_cam; a plane fixed in the world moves along.
+            r0, r1, r2 = y * j2 - z * j1, z * j0 - x * j2, x * j1 - y * j0
+            t0, t1, t2 = j0, j1, j2
+            if views.in_world[i]:
+                nx, ny, nz = views.normal[i, 0], views.normal[i, 1], views.normal[i, 2]
+                r0 += ny * n2 - nz * n1
+                r1 += nz * n0 - nx * n2
+                r2 += nx * n1 - ny * n0
+                t0 += by_distance * nx
+                t1 += by_distance * ny
+                t2 += by_distance * nz
+            pose_map = views.pose_map[i]
+            for j in range(6):
+                out[POSE, row, j] = (
+                    r0 * pose_map[0, j] + r1 * pose_map[1, j] + r2 * pose_map[2, j]
+                    + t0 * pose_map[3, j] + t1 * pose_map[4, j] + t2 * pose_map[5, j]
+                )  # fmt: skip
+        if columns[PLANE] >= 0:
+            plane_map = views.plane_map[i]
+            for j in range(3):
+                out[PLANE, row, j] = (
+                    n0 * plane_map[0, j] + n1 * plane_map[1, j] + n2 * plane_map[2, j] + by_distance * plane_map[3, j]
+                )
+        if columns[MEDIUM] >= 0:
+            out[MEDIUM, row, 0] = values[_BY_INDEX + row]
+        if columns[LENS] >= 0:
+            for j in range(widths[LENS]):
+                out[LENS, row, j] = tracks.lens[k, row, j]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", inline="always")
+def _subtract_outer(matrix, row, column, a, b, height, width):
+    """`matrix[row:, column:] -= a^T b` for a (3, height) and b (3, width)."""
+    if height == 6 and width == 6:
+        # The common case, with constant bounds so that the compiler unrolls it.
+        for i in range(6):
+            a0, a1, a2 = a[0, i], a[1, i], a[2, i]
+            for j in range(6):
+                matrix[row + i, column + j] -= a0 * b[0, j] + a1 * b[1, j] + a2 * b[2, j]
+    elif width == 3:
+        for i in range(height):
+            a0, a1, a2 = a[0, i], a[1, i], a[2, i]
+            for j in range(3):
+                matrix[row + i, column + j] -= a0 * b[0, j] + a1 * b[1, j] + a2 * b[2, j]
+    elif width == 6:
+        for i in range(height):
+            a0, a1, a2 = a[0, i], a[1, i], a[2, i]
+            for j in range(6):
+                matrix[row + i, column + j] -= a0 * b[0, j] + a1 * b[1, j] + a2 * b[2, j]
+    else:
+        for i in range(height):
+            a0, a1, a2 = a[0, i], a[1, i], a[2, i]
+            for j in range(width):
+                matrix[row + i, column + j] -= a0 * b[0, j] + a1 * b[1, j] + a2 * b[2, j]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def reduce(points, hold_points, anchors, first_track, stop_track, tracks, views, optics, loss, scale, matrix, gradient):
+    """Add the reduced system of settled points to `matrix` and `gradient`.
+
+    Args:
+        points: (P, 3) world positions at their minima (see `settle`).
+        hold_points: whether the points are known, so that none is eliminated.
+        anchors: the proximal terms.
+        first_track, stop_track: the range of points to work on.
+        tracks, views, optics: see the tuples.
+        loss, scale: robust loss and its scale in pixels.
+        matrix: (n, n), the upper triangle is added to (blocks on the diagonal are filled).
+        gradient: (n,).
+
+    Returns:
+        The summed cost.
+    """
+    num_lens = tracks.lens.shape[2]
+    widths = (6, 3, 1, num_lens)
+    most = max(6, num_lens)
+    longest = 1
+    for p in range(first_track, stop_track):
+        longest = max(longest, tracks.start[p + 1] - tracks.start[p])
+    values = np.empty(_VALUES)
+    by_blocks = np.empty((4, 2, most))
+    v = np.empty(6)
+    point_gradient = np.empty(3)
+    lower = np.empty(6)
+    # The blocks that the current point touches, and where a column's block stands among them.
+    touched_column = np.empty(4 * longest, dtype=np.int64)
+    touched_width = np.empty(4 * longest, dtype=np.int64)
+    coupling = np.empty((4 * longest, 3, most))
+    place = np.full(gradient.shape[0], -1, dtype=np.int64)
+    total = 0.0
+    for p in range(first_track, stop_track):
+        first, stop = tracks.start[p], tracks.start[p + 1]
+        for j in range(6):
+            v[j] = 0.0
+        for j in range(3):
+            point_gradient[j] = 0.0
+        num_touched = 0
+        for k in range(first, stop):
+            i = tracks.image[k]
+            _observe(k, points[p], tracks, views, optics, True, values)
+            e0, e1 = values[_RESIDUAL], values[_RESIDUAL + 1]
+            rho, weight = _robust(e0 * e0 + e1 * e1, loss, scale)
+            total += 0.5 * rho
+            rotation = views.rotation[i]
+            b00, b01, b02 = _by_world_point(0, rotation, values)
+            b10, b11, b12 = _by_world_point(1, rotation, values)
+            v[0] += weight * (b00 * b00 + b10 * b10)
+            v[1] += weight * (b00 * b01 + b10 * b11)
+            v[2] += weight * (b00 * b02 + b10 * b12)
+            v[3] += weight * (b01 * b01 + b11 * b11)
+            v[4] += weight * (b01 * b02 + b11 * b12)
+            v[5] += weight * (b02 * b02 + b12 * b12)
+            point_gradient[0] += weight * (e0 * b00 + e1 * b10)
+            point_gradient[1] += weight * (e0 * b01 + e1 * b11)
+            point_gradient[2] += weight * (e0 * b02 + e1 * b12)
+            _by_blocks(k, values, tracks, views, widths, by_blocks)
+            for slot in range(4):
+                column = views.columns[i, slot]
+                if column < 0:
+                    continue
+                width = widths[slot]
+                at = place[column]
+                if at < 0:
+                    at = num_touched
+                    place[column] = at
+                    touched_column[at] = column
+                    touched_width[at] = width
+                    num_touched += 1
+                    for j in range(width):
+                        coupling[at, 0, j] = 0.0
+                        coupling[at, 1, j] = 0.0
+                        coupling[at, 2, j] = 0.0
+                for j in range(width):
+                    a0 = weight * by_blocks[slot, 0, j]
+                    a1 = weight * by_blocks[slot, 1, j]
+                    coupling[at, 0, j] += a0 * b00 + a1 * b10
+                    coupling[at, 1, j] += a0 * b01 + a1 * b11
+                    coupling[at, 2, j] += a0 * b02 + a1 * b12
+                    gradient[column + j] += a0 * e0 + a1 * e1
+                for other in range(4):
+                    other_column = views.columns[i, other]
+                    if other_column < column:
+                        continue
+                    for j in range(width):
+                        a0 = weight * by_blocks[slot, 0, j]
+                        a1 = weight * by_blocks[slot, 1, j]
+                        for m in range(widths[other]):
+                            matrix[column + j, other_column + m] += (
+                                a0 * by_blocks[other, 0, m] + a1 * by_blocks[other, 1, m]
+                            )
+        if not hold_points:
+            weight = anchors.weight[p]
+            if weight > 0.0:
+                v[0] += weight
+                v[3] += weight
+                v[5] += weight
+                for j in range(3):
+                    change = points[p, j] - anchors.position[p, j]
+                    total += 0.5 * weight * change * change
+                    point_gradient[j] += weight * change
+            _factor(v, 0.0, lower)
+            y0, y1, y2 = _forward(lower, point_gradient[0], point_gradient[1], point_gradient[2])
+            total -= 0.5 * (y0 * y0 + y1 * y1 + y2 * y2)
+            for a in range(num_touched):
+                column = touched_column[a]
+                for j in range(touched_width[a]):
+                    w0, w1, w2 = _forward(lower, coupling[a, 0, j], coupling[a, 1, j], coupling[a, 2, j])
+                    coupling[a, 0, j], coupling[a, 1, j], coupling[a, 2, j] = w0, w1, w2
+                    gradient[column + j] -= w0 * y0 + w1 * y1 + w2 * y2
+            for a in range(num_touched):
+                column = touched_column[a]
+                width = touched_width[a]
+                for b in range(num_touched):
+                    if touched_column[b] >= column:
+                        _subtract_outer(
+                            matrix, column, touched_column[b], coupling[a], coupling[b], width, touched_width[b]
+                        )
+        for a in range(num_touched):
+            place[touched_column[a]] = -1
+    return total
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def residuals(points, tracks, views, optics, out):
+    """Residuals (N, 2) in pixels of all observations at the given points, into `out`; no loss, no change."""
+    values = np.empty(_VALUES)
+    for p in range(points.shape[0]):
+        for k in range(tracks.start[p], tracks.start[p + 1]):
+            _observe(k, points[p], tracks, views, optics, False, values)
+            out[k, 0], out[k, 1] = values[_RESIDUAL], values[_RESIDUAL + 1]

@@ -1,0 +1,146 @@
+"""What a user can ask for, declared once: the Python interface, the command line and its help come from here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from colmap_refract.errors import RefractError
+from colmap_refract.interface import Layers
+
+if TYPE_CHECKING:
+    import pycolmap
+
+Scenario = Literal["moving_interface", "static_interface", "fixed_camera", "camera_housing"]
+Loss = Literal["trivial", "huber", "soft_l1", "cauchy"]
+
+NUM_FILTER_ROUNDS = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class BundleAdjustmentOptions:
+    """What the adjustment may change, and how it is solved."""
+
+    refine_rig_from_world: bool = True
+    """Refine the poses. Held poses must be known in units of the true scale."""
+    refine_points3D: bool = True
+    """Refine the points."""
+    refine_focal_length: bool = False
+    """Refine the focal lengths. Only with many obliques: refraction and focal length look alike."""
+    refine_principal_point: bool = False
+    """Refine the principal points."""
+    refine_extra_params: bool = False
+    """Refine the distortion parameters."""
+    loss_function_type: Loss = "cauchy"
+    """Robust loss on the reprojection errors."""
+    loss_function_scale: float | None = None
+    """Scale of the loss, px. By default four times the noise that the residuals show."""
+    max_num_iterations: int = 100
+    """Of the solver, each time it runs."""
+    function_tolerance: float = 1e-9
+    """Relative change of the cost at which the solver stops."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefinerOptions:
+    """How a model photographed through a plane interface is refined."""
+
+    scenario: Scenario
+    """What is shared: moving_interface (nothing: each image has its own pose and plane),
+    static_interface (one plane, fixed in the world), fixed_camera (one pose, a plane per image),
+    camera_housing (one plane per camera, fixed in the camera)."""
+
+    refractive_index: float = 1.333
+    """Of the medium the scene is in, relative to the camera's. Fresh water 1.333, sea water 1.340."""
+    layer_thickness: tuple[float, ...] = ()
+    """Thickness of each wall between camera and water, nearest the camera first; in metres if
+    interface_distance is given, otherwise in units of the model."""
+    layer_refractive_index: tuple[float, ...] = ()
+    """Refractive index of each wall. Glass 1.52, acrylic 1.49."""
+
+    interface_distance: float | None = None
+    """Distance, in metres, of the reference image's projection centre from the interface. Makes the
+    result metric."""
+    interface_normal: tuple[float, float, float] | None = None
+    """Normal of the interface, from the camera into the water, in the camera's frame (of the reference
+    image, if the interface is fixed in the world). A start, unless refine_interface_normal is off."""
+    refine_interface_distance: bool = True
+    """Off: every image's distance is held at interface_distance."""
+    refine_interface_normal: bool = True
+    """Off: the normal is held at interface_normal, or the optical axis."""
+    initial_distance_ratio: float | None = None
+    """Distance to start from, as a fraction of the median depth. By default several are tried."""
+    refine_refractive_index: bool = False
+    """Refine the index of the water. Rarely determined by the data; the report says if it is not."""
+
+    reference_image: str = ""
+    """Name of the image that interface_distance and interface_normal speak of, and whose pose a fixed
+    camera keeps. By default the one with most observations."""
+    interface_groups: Mapping[str, str] = field(default_factory=dict)
+    """Image name to group name: the images of a group are known to share one interface."""
+    dry_images: frozenset[str] = frozenset()
+    """Names of images taken without any interface."""
+    cameras: Mapping[int, pycolmap.Camera] = field(default_factory=dict)
+    """Intrinsics calibrated in air by camera id, in place of the model's. Key 0 stands for every camera."""
+
+    filter_max_reproj_error: float = 4.0
+    """Observations with a larger refractive reprojection error, px, are removed. 0: keep all."""
+    filter_min_tri_angle: float | None = None
+    """Points whose refracted rays meet at a smaller angle, degrees, are removed. By default 0.5, and
+    0 with a fixed camera, whose rays differ by refraction only."""
+
+    BundleAdjustment: BundleAdjustmentOptions = BundleAdjustmentOptions()
+    num_threads: int = -1
+    """Of the solver; -1: as many as there are cores."""
+    random_seed: int = 0
+    """Of the choice of tracks that a start is tried on."""
+
+    def __post_init__(self) -> None:
+        if len(self.layer_thickness) != len(self.layer_refractive_index):
+            raise RefractError(
+                f"{len(self.layer_thickness)} layer_thickness and {len(self.layer_refractive_index)} "
+                "layer_refractive_index: give one of each per wall"
+            )
+        _ = self.layers
+        if self.interface_distance is not None and not 0 < self.interface_distance < np.inf:
+            raise RefractError(
+                f"interface_distance {self.interface_distance:g} is not in front of the camera: give metres > 0"
+            )
+        if self.interface_normal is not None:
+            normal = np.array(self.interface_normal)
+            if not (np.isfinite(normal).all() and np.linalg.norm(normal) > 0):
+                raise RefractError(f"interface_normal {self.interface_normal} is not a direction: give e.g. 0 0 1")
+            if normal[2] <= 0:
+                raise RefractError(
+                    f"interface_normal {self.interface_normal} points to the interface behind the camera: "
+                    "it must point from the camera into the water (z > 0)"
+                )
+        if not self.refine_interface_distance and self.interface_distance is None:
+            raise RefractError("refine_interface_distance is off, but there is no interface_distance to hold")
+        if self.initial_distance_ratio is not None and not 0 < self.initial_distance_ratio < 1:
+            raise RefractError(
+                f"initial_distance_ratio {self.initial_distance_ratio:g} puts the interface behind the camera or "
+                "beyond the points: give a fraction between 0 and 1"
+            )
+        if self.filter_max_reproj_error < 0 or (self.filter_min_tri_angle or 0.0) < 0:
+            raise RefractError("filter_max_reproj_error and filter_min_tri_angle cannot be negative")
+        scale = self.BundleAdjustment.loss_function_scale
+        if scale is not None and not scale > 0:
+            raise RefractError(f"loss_function_scale {scale:g} px is not positive")
+
+    @property
+    def layers(self) -> Layers:
+        """The media behind the first interface, with thicknesses as given."""
+        return Layers(
+            thickness=tuple(self.layer_thickness), index=(*self.layer_refractive_index, self.refractive_index)
+        )
+
+    @property
+    def min_tri_angle(self) -> float:
+        """`filter_min_tri_angle` with its default."""
+        if self.filter_min_tri_angle is not None:
+            return self.filter_min_tri_angle
+        return 0.0 if self.scenario == "fixed_camera" else 0.5

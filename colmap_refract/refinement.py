@@ -1,0 +1,478 @@
+"""The sequence a user sees: read, start, solve, filter and solve again, judge, put back into the model's frame."""
+
+from __future__ import annotations
+
+import logging
+import os
+from dataclasses import asdict, dataclass, replace
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from colmap_refract.adjustment import Adjustment, Problem, SolverSettings, adjust, settle_points
+from colmap_refract.advice import Facts, advise
+from colmap_refract.alignment import Similarity, align_poses, rescale_about
+from colmap_refract.arrangement import Arrangement, arrange
+from colmap_refract.continuation import Watch, named, estimate_noise, find_start, is_sound, spread_out
+from colmap_refract.errors import RefractError
+from colmap_refract.filtering import filter_observations, label_wet, pinhole_errors, reprojection_errors
+from colmap_refract.interface import Array, plane_in_cam
+from colmap_refract.model_io import copy_model
+from colmap_refract.observations import Observations, lift, read_observations
+from colmap_refract.options import NUM_FILTER_ROUNDS, RefinerOptions
+from colmap_refract.scenario import State
+from colmap_refract.sidecar import ImageInterface, Sidecar, WorldPlane
+from colmap_refract.uncertainty import Uncertainty, estimate_uncertainty
+
+if TYPE_CHECKING:
+    import pycolmap
+
+logger = logging.getLogger(__name__)
+
+LOSS_SCALE_IN_NOISE = 4.0
+"""Of the default loss: wide enough to lose nothing on Gaussian noise, narrow enough to stop a wrong match."""
+_LEAST_LOSS_SCALE = 1.0
+_NEGLIGIBLE_CHANGE = 1e-3
+"""Part of the observations whose removal or relabelling is not worth another solve."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refinement:
+    """What `refine` returns.
+
+    Attributes:
+        reconstruction: the refined model, a new object; ids, names, keypoints, colours and tracks are the
+            input's but for what was filtered, and `point3D.error` is the refractive error in px.
+        sidecar: the planes, their standard deviations, the solver's word and the counts: `refraction.json`.
+        warnings: what is badly determined or looks wrong, and what to do about it, one sentence each.
+        converged: whether the solver came to a minimum.
+    """
+
+    reconstruction: pycolmap.Reconstruction
+    sidecar: Sidecar
+    warnings: tuple[str, ...]
+    converged: bool
+
+
+@dataclass
+class _Counts:
+    """What was removed on the way."""
+
+    large_error: int = 0
+    small_angle: int = 0
+    unusable: int = 0
+
+
+def refine(
+    reconstruction: pycolmap.Reconstruction, options: RefinerOptions, *, watch: Watch | None = None
+) -> Refinement:
+    """Refine a model whose images were taken through plane interfaces.
+
+    Args:
+        reconstruction: a COLMAP model that ignored refraction; not altered.
+        options: the scenario, what is known and what is held.
+        watch: called with the stage's name and the solver's progress after every iteration.
+
+    Returns:
+        `Refinement`, in the input's world frame and size (in metres if `interface_distance` is given).
+
+    Raises:
+        RefractError: the model or the options cannot be used; one line says what to do.
+        KeyboardInterrupt: Ctrl-C during a solve; nothing has been changed.
+    """
+    started = perf_counter()
+    model = copy_model(reconstruction)
+    _check_model(model)
+    original = read_observations(model)
+    _replace_cameras(model, options)
+    observations = read_observations(model)
+    if not len(observations.points):
+        raise RefractError("the model has no point that two registered images see: there is nothing to refine")
+    before = pinhole_errors(original)
+    arrangement = arrange(observations, options)
+    counts = _Counts(unusable=model.compute_num_observations() - len(observations.image))
+    num_threads = options.num_threads if options.num_threads > 0 else len(os.sched_getaffinity(0))
+    settings = SolverSettings(
+        num_threads=num_threads,
+        max_num_iterations=options.BundleAdjustment.max_num_iterations,
+        function_tolerance=options.BundleAdjustment.function_tolerance,
+    )
+    solve_started = perf_counter()
+    try:
+        arrangement, problem, adjustment = _solve(arrangement, settings, counts, watch)
+    except FloatingPointError as error:
+        raise RefractError(f"the adjustment could not be evaluated ({error}): check the model and the scenario") from None
+    solve_seconds = perf_counter() - solve_started
+    uncertainty = estimate_uncertainty(problem)
+    errors = reprojection_errors(problem, arrangement.observations)
+    noise = estimate_noise(problem)
+    facts = Facts(
+        arrangement=arrangement,
+        problem=problem,
+        adjustment=adjustment,
+        uncertainty=uncertainty,
+        noise=noise,
+        pinhole_errors=before,
+        errors=errors,
+    )
+    warnings = advise(facts)
+    to_output = _output_frame(arrangement, problem.state, problem.points)
+    _write_back(model, arrangement, problem, errors, to_output)
+    sidecar = _sidecar(arrangement, problem, adjustment, uncertainty, noise, to_output, warnings)
+    sidecar.statistics.update(
+        _statistics(reconstruction, model, before, errors, counts, problem, noise, solve_seconds, perf_counter() - started)
+    )
+    return Refinement(
+        reconstruction=model,
+        sidecar=sidecar,
+        warnings=tuple(warnings),
+        converged=adjustment.termination == "convergence",
+    )
+
+
+def _check_model(model: pycolmap.Reconstruction) -> None:
+    """What `read_model` also checks, for models that come from a script."""
+    if model.num_reg_images() == 0:
+        raise RefractError("the model has no registered image: there is nothing to refine")
+    if model.num_points3D() == 0:
+        raise RefractError("the model has no points: there is nothing to refine")
+    for point3D_id, point in model.points3D.items():
+        if not np.isfinite(point.xyz).all():
+            raise RefractError(f"point {point3D_id} has a position that is not finite: remove it from the model")
+    for frame_id in model.reg_frame_ids():
+        pose = model.frame(frame_id).rig_from_world
+        if not (np.isfinite(pose.rotation.quat).all() and np.isfinite(pose.translation).all()):
+            raise RefractError(f"frame {frame_id} has a pose that is not finite: deregister it")
+
+
+def _replace_cameras(model: pycolmap.Reconstruction, options: RefinerOptions) -> None:
+    """In-air intrinsics in place of the model's: keypoints are raw pixels, so that is sound."""
+    for camera_id, camera in model.cameras.items():
+        known = options.cameras.get(camera_id, options.cameras.get(0))
+        if known is None:
+            if options.cameras:
+                raise RefractError(
+                    f"the given intrinsics have no camera {camera_id}, which the model uses; they have "
+                    f"{', '.join(str(i) for i in sorted(options.cameras))}"
+                )
+            continue
+        if (known.width, known.height) != (camera.width, camera.height):
+            raise RefractError(
+                f"camera {camera_id} takes images of {camera.width} x {camera.height} px, the given intrinsics are for "
+                f"{known.width} x {known.height} px: calibrate at the size of the images"
+            )
+        camera.model = known.model
+        camera.params = known.params
+        camera.has_prior_focal_length = True
+
+
+def _solve(
+    arrangement: Arrangement, settings: SolverSettings, counts: _Counts, watch: Watch | None
+) -> tuple[Arrangement, Problem, Adjustment]:
+    """Start, solve, filter and solve again, until nothing more is removed."""
+    options = arrangement.options
+    start = find_start(arrangement, settings, watch)
+    problem = _with_loss(arrangement, spread_out(arrangement, start), estimate_noise(start.problem))
+    coarse = replace(settings, function_tolerance=max(1e-5, settings.function_tolerance))
+    adjustment = adjust(problem, coarse, on_progress=named(watch, "Refractive bundle adjustment"))
+    problem = replace(problem, state=adjustment.state, points=adjustment.points)
+    if not is_sound(problem):
+        _raise_unsound(problem)
+    for round_ in range(NUM_FILTER_ROUNDS + 1):
+        arrangement, problem = _filter(arrangement, problem, counts)
+        stage = "Refractive bundle adjustment" + (f", filtered {round_ + 1}x" if round_ else "")
+        problem = _with_loss(arrangement, problem, estimate_noise(problem))
+        adjustment = adjust(problem, settings, on_progress=named(watch, stage))
+        problem = replace(problem, state=adjustment.state, points=adjustment.points)
+        arrangement, problem, moved = _relift(arrangement, problem)
+        if not (moved or _would_change(arrangement, problem)):
+            break
+    # The last few outliers say too little to solve everything again for: their points alone are settled anew.
+    arrangement, problem = _filter(arrangement, problem, counts)
+    problem = replace(problem, points=settle_points(problem, settings))
+    if not is_sound(problem):
+        _raise_unsound(problem)
+    return arrangement, problem, adjustment
+
+
+def _with_loss(arrangement: Arrangement, problem: Problem, noise: float) -> Problem:
+    adjustment = arrangement.options.BundleAdjustment
+    scale = adjustment.loss_function_scale
+    if scale is None:
+        scale = max(LOSS_SCALE_IN_NOISE * noise, _LEAST_LOSS_SCALE)
+    return replace(problem, loss=adjustment.loss_function_type, loss_scale=scale)
+
+
+def _marks(arrangement: Arrangement, problem: Problem) -> Any:
+    options = arrangement.options
+    return filter_observations(
+        problem,
+        arrangement.observations,
+        max_reproj_error=options.filter_max_reproj_error,
+        min_tri_angle=options.min_tri_angle,
+    )
+
+
+def _would_change(arrangement: Arrangement, problem: Problem) -> bool:
+    relabelled = (label_wet(problem) != problem.tracks.wet).mean()
+    removed = 1.0 - _marks(arrangement, problem).keep.mean()
+    return bool(max(relabelled, removed) > _NEGLIGIBLE_CHANGE)
+
+
+def _filter(arrangement: Arrangement, problem: Problem, counts: _Counts) -> tuple[Arrangement, Problem]:
+    """Label wet and dry anew, remove outliers, and count them."""
+    problem = replace(problem, tracks=problem.tracks._replace(wet=label_wet(problem)))
+    marks = _marks(arrangement, problem)
+    if marks.keep.all():
+        return arrangement, problem
+    observations = arrangement.observations.select(marks.keep)
+    if not len(observations.points):
+        raise RefractError(
+            "every point was filtered: the scenario or the intrinsics do not fit the images, or "
+            "filter_max_reproj_error is too small for this noise"
+        )
+    counts.large_error += marks.num_large_error
+    counts.small_angle += marks.num_small_angle
+    kept_points = np.isin(arrangement.observations.point3D_ids, observations.point3D_ids)
+    kept = marks.keep & np.repeat(kept_points, np.diff(problem.tracks.start))
+    arrangement = replace(arrangement, observations=observations)
+    tracks = arrangement.tracks(observations)._replace(wet=problem.tracks.wet[kept])
+    return arrangement, replace(problem, tracks=tracks, points=problem.points[kept_points])
+
+
+def _relift(arrangement: Arrangement, problem: Problem) -> tuple[Arrangement, Problem, bool]:
+    """Refined intrinsics put into the cameras and the keypoints lifted anew; whether they still moved."""
+    if problem.held.lens:
+        return arrangement, problem, False
+    change = problem.state.lens
+    largest = 0.0
+    for c, camera in enumerate(arrangement.observations.cameras):
+        params = np.array(camera.params)
+        for j, index in enumerate(arrangement.lens_parameters[c]):
+            params[index] += change[c, j]
+            largest = max(largest, abs(change[c, j]) / max(abs(params[index]), 1e-3))
+        camera.params = params
+    observations = lift(arrangement.observations)
+    if len(observations.image) != len(problem.tracks.image):
+        raise RefractError("the refined intrinsics do not see all keypoints any more: hold the distortion parameters")
+    arrangement = replace(arrangement, observations=observations)
+    tracks = arrangement.tracks(observations)._replace(wet=problem.tracks.wet)
+    state = replace(problem.state, lens=np.zeros_like(change))
+    return arrangement, replace(problem, tracks=tracks, state=state), largest > 1e-4
+
+
+def _raise_unsound(problem: Problem) -> None:
+    _, distance = problem.state.planes_in_cam(problem.structure)
+    if np.nanmin(distance) <= 1e-4:
+        raise RefractError(
+            "the interface ran into the camera: the data do not show it at a distance; give interface_distance and "
+            "interface_normal with refine_interface_distance off, check the scenario, and use intrinsics from air (camera_path)"
+        )
+    raise RefractError(
+        "the interface ran beyond the points, where nothing is refracted: either the scene is dry, or the intrinsics "
+        "have absorbed the refraction (give those calibrated in air, camera_path), or the scenario is another one"
+    )
+
+
+def _output_frame(arrangement: Arrangement, state: State, points: Array) -> Similarity:
+    """From units of the solve to the output: the input's frame and size, or metres."""
+    options, observations = arrangement.options, arrangement.observations
+    back = Similarity(scale=arrangement.unit, rotation=np.eye(3), translation=arrangement.origin)
+    metric = None
+    if options.interface_distance is not None and not arrangement.scale_known:
+        _, distance = state.planes_in_cam(arrangement.structure)
+        metric = options.interface_distance / (arrangement.unit * float(distance[arrangement.reference]))
+    known = 1.0 if arrangement.scale_known else None
+    aligned = None
+    if not arrangement.held.poses.all() or options.scenario == "fixed_camera":
+        source = state.cam_from_world(arrangement.structure)
+        target = observations.cam_from_world
+        if options.scenario != "fixed_camera":
+            aligned = align_poses(source, target, spread=1e-3, scale=metric if metric is not None else known)
+        if aligned is None:
+            # The cameras stand at one place: their distance to the points tells the size.
+            center = -target[0][arrangement.reference].T @ target[1][arrangement.reference]
+            scale = metric if metric is not None else known
+            if scale is None:
+                before = np.median(np.linalg.norm(observations.points - center, axis=1))
+                scale = float(before / np.median(np.linalg.norm(points - center, axis=1)))
+            aligned = rescale_about(center, scale)
+    elif metric is not None:
+        aligned = rescale_about(np.zeros(3), metric)
+    if aligned is None:
+        return back
+    return Similarity(
+        scale=back.scale * aligned.scale,
+        rotation=aligned.rotation,
+        translation=back.scale * aligned.translation + back.translation,
+    )
+
+
+def _write_back(
+    model: pycolmap.Reconstruction, arrangement: Arrangement, problem: Problem, errors: Array, to_output: Similarity
+) -> None:
+    """Poses, points, errors and intrinsics into the model, and what was removed out of it."""
+    import pycolmap
+
+    observations, state = arrangement.observations, problem.state
+    rotation, translation = to_output.cam_from_world(state.rotation, state.translation)
+    for f, frame_id in enumerate(observations.frame_ids):
+        pose = arrangement.frame_pose[f]
+        model.frame(int(frame_id)).rig_from_world = pycolmap.Rigid3d(
+            pycolmap.Rotation3d(rotation[pose]), translation[pose]
+        )
+    for camera_id, camera in zip(observations.camera_ids, observations.cameras, strict=True):
+        model.camera(int(camera_id)).params = camera.params
+    kept_points = set(observations.point3D_ids.tolist())
+    image_id = observations.image_ids[observations.image]
+    kept = set(zip(image_id.tolist(), observations.point2D_idx.tolist(), strict=True))
+    for point3D_id in list(model.point3D_ids()):
+        if point3D_id not in kept_points:
+            model.delete_point3D(point3D_id)
+            continue
+        # Elements are live references into a list that deleting changes.
+        elements = [(e.image_id, e.point2D_idx) for e in model.point3D(point3D_id).track.elements]
+        for element in elements:
+            if element not in kept:
+                model.delete_observation(*element)
+    points = to_output.points(problem.points)
+    mean_error = np.add.reduceat(errors, observations.start[:-1]) / np.diff(observations.start)
+    for point3D_id, xyz, error in zip(observations.point3D_ids.tolist(), points, mean_error, strict=True):
+        point = model.point3D(point3D_id)
+        point.xyz = xyz
+        point.error = float(error)
+
+
+def _sidecar(
+    arrangement: Arrangement,
+    problem: Problem,
+    adjustment: Adjustment,
+    uncertainty: Uncertainty,
+    noise: float,
+    to_output: Similarity,
+    warnings: list[str],
+) -> Sidecar:
+    observations, structure, state = arrangement.observations, arrangement.structure, problem.state
+    scale = to_output.scale
+    layers = problem.layers.with_index(state.index).scaled(scale)
+    names = _plane_names(arrangement)
+    world_planes = {}
+    for block in np.flatnonzero(structure.plane_in_world):
+        offset = state.distance[block] + state.normal[block] @ structure.plane_anchor[block]
+        normal, offset = to_output.plane(state.normal[block], float(offset))
+        world_planes[names[block]] = WorldPlane(normal_in_world=_unit(normal), offset=offset)
+    rotation, translation = to_output.cam_from_world(*state.cam_from_world(structure))
+    cam_normal, cam_distance = state.planes_in_cam(structure)
+    images = {}
+    for i, name in enumerate(observations.image_names):
+        block = int(structure.image_plane[i])
+        if block < 0:
+            images[name] = ImageInterface(image_id=int(observations.image_ids[i]))
+            continue
+        normal, distance = cam_normal[i], scale * float(cam_distance[i])
+        if structure.plane_in_world[block]:
+            plane = world_planes[names[block]]
+            normal, distance = plane_in_cam(np.array(plane.normal_in_world), plane.offset, rotation[i], translation[i])
+        images[name] = ImageInterface(
+            image_id=int(observations.image_ids[i]),
+            normal_in_cam=_unit(normal),
+            distance=distance,
+            group=names[block],
+            normal_std_deg=_finite(np.degrees(uncertainty.normal[block]) * noise),
+            distance_std=_finite(scale * uncertainty.distance[block] * noise),
+        )
+    metric = arrangement.options.interface_distance is not None
+    length = "metre" if metric else "unit of the input model"
+    options = asdict(replace(arrangement.options, cameras={}))
+    options["dry_images"] = sorted(arrangement.options.dry_images)
+    options["interface_groups"] = dict(arrangement.options.interface_groups)
+    del options["cameras"]
+    return Sidecar(
+        scenario=arrangement.options.scenario,
+        layers=layers,
+        images=images,
+        world_planes=world_planes,
+        units={
+            "distance": length, "offset": length, "thickness": length, "distance_std": length,
+            "normal_std_deg": "degree", "reprojection_error": "pixel", "noise": "pixel",
+        },
+        options=options,
+        solver={
+            "termination": adjustment.termination,
+            "converged": adjustment.termination == "convergence",
+            "message": adjustment.message,
+            "num_iterations": adjustment.num_iterations,
+            "cost": adjustment.cost,
+            "gradient_max_norm": adjustment.gradient_max_norm,
+            "newton_decrement": uncertainty.decrement,
+            "loss_function_type": problem.loss,
+            "loss_function_scale": problem.loss_scale,
+            "refractive_index": state.index,
+            "refractive_index_std": _finite(uncertainty.index * noise),
+            "reference_image": observations.image_names[arrangement.reference],
+            "warnings": list(warnings),
+        },
+        statistics={},
+    )  # fmt: skip
+
+
+def _statistics(
+    reconstruction: pycolmap.Reconstruction,
+    model: pycolmap.Reconstruction,
+    before: Array,
+    errors: Array,
+    counts: _Counts,
+    problem: Problem,
+    noise: float,
+    solve_seconds: float,
+    total_seconds: float,
+) -> dict[str, Any]:
+    seen = before[np.isfinite(before)]
+    return {
+        "num_images": model.num_images(),
+        "num_reg_images": model.num_reg_images(),
+        "num_points3D_before": reconstruction.num_points3D(),
+        "num_points3D": model.num_points3D(),
+        "num_observations_before": reconstruction.compute_num_observations(),
+        "num_observations": model.compute_num_observations(),
+        "mean_pinhole_error_before": float(seen.mean()) if len(seen) else None,
+        "median_pinhole_error_before": float(np.median(seen)) if len(seen) else None,
+        "mean_reprojection_error": float(errors.mean()),
+        "median_reprojection_error": float(np.median(errors)),
+        "noise": noise,
+        "num_filtered_large_error": counts.large_error,
+        "num_filtered_small_angle": counts.small_angle,
+        "num_unusable_observations": counts.unusable,
+        "num_dry_observations": int((~problem.tracks.wet).sum()),
+        "solve_seconds": solve_seconds,
+        "total_seconds": total_seconds,
+    }
+
+
+def _plane_names(arrangement: Arrangement) -> list[str]:
+    """A name for each plane: its group's, or what the scenario ties it to."""
+    observations, structure = arrangement.observations, arrangement.structure
+    names = []
+    for block, group in enumerate(arrangement.plane_names):
+        first = int(np.flatnonzero(structure.image_plane == block)[0])
+        if group is not None:
+            names.append(group)
+        elif arrangement.options.scenario == "static_interface":
+            names.append("world")
+        elif arrangement.options.scenario == "camera_housing":
+            names.append(f"camera {observations.camera_ids[observations.image_camera[first]]}")
+        else:
+            names.append(observations.image_names[first])
+    return names
+
+
+def _unit(vector: Array) -> tuple[float, float, float]:
+    x, y, z = (vector / np.linalg.norm(vector)).tolist()
+    return x, y, z
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+

@@ -1,0 +1,200 @@
+"""How well a solution is determined: covariances of the camera side, from the reduced system.
+
+Seven directions (a similarity of the world) change no observation and have no variance of their own; the
+covariance is the one in which the poses as a whole stay in place (inner constraints), or the planes where
+the poses are held. A rig with a baseline, or a wall of known thickness, fixes the scale: then there are six.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from scipy.linalg import null_space
+from scipy.sparse.linalg import splu
+
+from colmap_refract.adjustment import Problem, split
+from colmap_refract.elimination import MEDIUM, PLANE, POSE
+from colmap_refract.interface import Array, tangent_basis
+
+Key = tuple[int, int]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Uncertainty:
+    """Standard deviations for observations of unit noise; multiply by the noise in px.
+
+    Attributes:
+        normal: (B,) of each plane's normal, radians (the larger axis of its ellipse).
+        distance: (B,) of each plane's distance, units of the solve, the poses staying in place.
+        index: of the refractive index, NaN where it was held.
+        index_correlation: largest correlation of the index with the planes.
+        decrement: what Newton's method would still gain, over the cost: a measure of convergence without units.
+        determined: whether the system has full rank but for the gauge.
+    """
+
+    normal: Array
+    distance: Array
+    index: float
+    index_correlation: float
+    decrement: float
+    determined: bool
+
+
+def gauge(problem: Problem, keys: list[Key], columns: dict[Key, int], num_columns: int) -> Array:
+    """The changes of the free blocks (num_columns, 0 to 7) that no observation can see."""
+    structure, state = problem.structure, problem.state
+    full: dict[Key, Array] = {}
+    for f, (rotation, translation) in enumerate(zip(state.rotation, state.translation, strict=True)):
+        by = np.zeros((6, 7))
+        for j, axis in enumerate(np.eye(3)):
+            by[3:, j] = -rotation @ axis
+            by[:3, 3 + j] = -rotation @ axis
+            by[3:, 3 + j] = np.cross(rotation @ axis, translation)
+        by[3:, 6] = translation
+        full[POSE, f] = by
+    for b, normal in enumerate(state.normal):
+        by = np.zeros((3, 7))
+        by[2, 6] = state.distance[b]
+        if structure.plane_in_world[b]:
+            anchor = structure.plane_anchor[b]
+            by[2, :3] = normal
+            for j, axis in enumerate(np.eye(3)):
+                turned = np.cross(axis, normal)
+                by[:2, 3 + j] = tangent_basis(normal).T @ turned
+                by[2, 3 + j] = -turned @ anchor
+            by[2, 6] += normal @ anchor
+        full[PLANE, b] = by
+    scale_fixed = any(h > 0 for h in problem.layers.thickness) or np.abs(structure.sensor_translation).max() > 1e-12
+    directions = np.eye(7)[:, : 6 if scale_fixed or problem.held.points else 7]
+    # Only combinations that leave all that is held where it is are free.
+    held = [by for key, by in full.items() if key not in columns]
+    held += [by[:2] for (slot, b), by in full.items() if slot == PLANE and problem.held.normals[b]]
+    held += [by[2:] for (slot, b), by in full.items() if slot == PLANE and problem.held.distances[b]]
+    if problem.held.points:
+        directions = directions[:, :0]
+    if held and directions.shape[1]:
+        blocked = np.concatenate(held) @ directions
+        if np.abs(blocked).max() > 1e-12:
+            directions = directions @ null_space(blocked, rcond=1e-9)
+    result = np.zeros((num_columns, directions.shape[1]))
+    for key in keys:
+        if key in full:
+            by = full[key] @ directions
+            result[columns[key] : columns[key] + len(by)] = by
+    return result
+
+
+def _fixed_columns(problem: Problem, columns: dict[Key, int]) -> NDArray[np.int64]:
+    """Columns of blocks that are only partly free."""
+    fixed = []
+    for (slot, b), first in columns.items():
+        if slot == PLANE:
+            fixed += [first, first + 1] if problem.held.normals[b] else []
+            fixed += [first + 2] if problem.held.distances[b] else []
+    return np.array(fixed, dtype=np.int64)
+
+
+def estimate_uncertainty(problem: Problem) -> Uncertainty:
+    """Covariances of planes and index at a solution.
+
+    Args:
+        problem: with `state` and `points` at the solution.
+
+    Returns:
+        `Uncertainty`, per pixel of noise; NaN for planes that are held or undetermined.
+    """
+    chunks = split(problem, 1)
+    keys = sorted({key for chunk in chunks for key in chunk.keys})
+    widths = {key: width for chunk in chunks for key, width in zip(chunk.keys, chunk.widths, strict=True)}
+    firsts = np.concatenate([[0], np.cumsum([widths[key] for key in keys])]).astype(int)
+    columns = dict(zip(keys, firsts[:-1].tolist(), strict=True))
+    n = int(firsts[-1])
+    num_planes = len(problem.state.normal)
+    nan = np.full(num_planes, np.nan)
+    unknown = Uncertainty(
+        normal=nan, distance=nan.copy(), index=np.nan, index_correlation=np.nan, decrement=0.0, determined=False
+    )
+    if n == 0:
+        return unknown
+    gradient = np.zeros(n)
+    cost = 0.0
+    rows, cols, values = [], [], []
+    for chunk in chunks:
+        reduced = chunk.reduce([np.zeros(w) for w in chunk.widths], None)
+        if reduced is None:
+            return unknown
+        place = np.concatenate([columns[key] + np.arange(widths[key]) for key in chunk.keys]).astype(np.int64)
+        matrix = np.triu(reduced[2])
+        matrix = matrix + np.triu(matrix, 1).T
+        i, j = np.nonzero(matrix)
+        rows.append(place[i])
+        cols.append(place[j])
+        values.append(matrix[i, j])
+        gradient[place] += reduced[1]
+        cost += reduced[0]
+    hessian = sp.csc_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(cols))), shape=(n, n))
+    free = np.setdiff1d(np.arange(n), _fixed_columns(problem, columns))
+    hessian = hessian[free][:, free]
+    diagonal = hessian.diagonal()
+    if not (diagonal > 0).all():
+        return unknown
+    scale = 1.0 / np.sqrt(diagonal)
+    scaled = sp.csc_array(sp.diags_array(scale) @ hessian @ sp.diags_array(scale))
+    directions = gauge(problem, keys, columns, n)[free]
+    # Inner constraints on the poses; on everything where no pose is free.
+    on_poses = np.concatenate([np.full(widths[key], key[0] == POSE) for key in keys])[free]
+    constraint = directions * (on_poses if on_poses.any() else np.ones_like(on_poses))[:, None] * scale[:, None]
+    norms = np.linalg.norm(constraint, axis=0)
+    constraint = constraint[:, norms > 0] / norms[norms > 0]
+    m = constraint.shape[1]
+    bordered = sp.block_array([[scaled, constraint], [constraint.T, None]], format="csc") if m else scaled
+    try:
+        solver = splu(sp.csc_array(bordered))
+    except RuntimeError:
+        return unknown
+    step = solver.solve(np.concatenate([gradient[free] * scale, np.zeros(m)]))[: len(free)]
+    decrement = float(0.5 * (gradient[free] * scale) @ step / max(cost, 1e-300))
+    position = np.full(n, -1)
+    position[free] = np.arange(len(free))
+
+    def covariance(indices: NDArray[np.int64]) -> tuple[Array, Array]:
+        """Columns of the covariance (free, k) and the block at `indices` (k, k)."""
+        right = np.zeros((len(free) + m, len(indices)))
+        right[indices, np.arange(len(indices))] = scale[indices]
+        solved = solver.solve(right)[: len(free)] * scale[:, None]
+        return solved, solved[indices]
+
+    normal, distance = nan.copy(), nan.copy()
+    determined = True
+    plane_variances = np.full(n, np.nan)
+    for b in range(num_planes):
+        if (PLANE, b) not in columns:
+            continue
+        at = position[columns[PLANE, b] + np.arange(3)]
+        here = at[at >= 0]
+        _, block = covariance(here)
+        variance = np.diag(block)
+        plane_variances[here] = variance
+        if not (np.isfinite(block).all() and (variance > 0).all()):
+            determined = False
+            continue
+        if at[0] >= 0:
+            normal[b] = np.sqrt(np.linalg.eigvalsh(block[:2, :2])[-1])
+        if at[2] >= 0:
+            distance[b] = np.sqrt(variance[-1])
+    index, correlation = np.nan, np.nan
+    if (MEDIUM, 0) in columns:
+        at = position[columns[MEDIUM, 0] + np.arange(1)]
+        column, block = covariance(at)
+        if block[0, 0] > 0:
+            index = float(np.sqrt(block[0, 0]))
+            with np.errstate(invalid="ignore"):
+                related = np.abs(column[:, 0]) / (index * np.sqrt(plane_variances[: len(free)]))
+            correlation = float(np.nanmax(related)) if np.isfinite(related).any() else np.nan
+    return Uncertainty(
+        normal=normal, distance=distance, index=index, index_correlation=correlation,
+        decrement=abs(decrement), determined=determined,
+    )  # fmt: skip

@@ -1,0 +1,685 @@
+"""Models survive reading and writing; damaged ones, and disks that fail, give one clear line and do no harm."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import shutil
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from colmap_refract import model_io
+from colmap_refract.errors import RefractError
+from colmap_refract.model_io import copy_model, output_folder, read_cameras, read_model, write_model
+
+THREE = ("cameras", "images", "points3D")
+FIVE = (*THREE, "rigs", "frames")
+
+
+def synthesize() -> pycolmap.Reconstruction:
+    """Two rigs of two cameras, three frames each, ten keypoints without a point in every image."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs = 2
+    options.num_cameras_per_rig = 2
+    options.num_frames_per_rig = 3
+    options.num_points3D = 30
+    return pycolmap.synthesize_dataset(options)
+
+
+@pytest.fixture(scope="module")
+def binary(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("binary")
+    synthesize().write_binary(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def text(tmp_path_factory: pytest.TempPathFactory, binary: Path) -> Path:
+    folder = tmp_path_factory.mktemp("text")
+    pycolmap.Reconstruction(binary).write_text(folder)
+    return folder
+
+
+@pytest.fixture
+def model(tmp_path: Path, binary: Path) -> Path:
+    """A copy of the binary model, to be damaged."""
+    return Path(shutil.copytree(binary, tmp_path / "model"))
+
+
+@pytest.fixture
+def text_model(tmp_path: Path, text: Path) -> Path:
+    return Path(shutil.copytree(text, tmp_path / "text_model"))
+
+
+def snapshot(folder: Path) -> dict[str, bytes]:
+    """Every file below `folder`, hidden ones included."""
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def patch(file: Path, at: int, data: bytes) -> None:
+    content = bytearray(file.read_bytes())
+    content[at : at + len(data)] = data
+    file.write_bytes(content)
+
+
+def error_of(call: Callable[[], object]) -> str:
+    with pytest.raises(RefractError) as caught:
+        call()
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+def assert_same(a: pycolmap.Reconstruction, b: pycolmap.Reconstruction) -> None:
+    assert set(a.cameras) == set(b.cameras) and set(a.images) == set(b.images) and set(a.points3D) == set(b.points3D)
+    for i, camera in a.cameras.items():
+        assert camera.model == b.cameras[i].model and np.array_equal(camera.params, b.cameras[i].params)
+    for i, image in a.images.items():
+        other = b.images[i]
+        assert image.name == other.name and image.camera_id == other.camera_id
+        assert np.abs(image.cam_from_world().matrix() - other.cam_from_world().matrix()).max() < 1e-12
+        assert [p.point3D_id for p in image.points2D] == [p.point3D_id for p in other.points2D]
+        assert np.array_equal([p.xy for p in image.points2D], [p.xy for p in other.points2D])
+    for i, point in a.points3D.items():
+        assert np.array_equal(point.xyz, b.points3D[i].xyz) and point.track.length() == b.points3D[i].track.length()
+
+
+# --------------------------------------------------------------------------- reading
+
+
+def test_reads_binary_and_text_alike(binary: Path, text: Path) -> None:
+    reconstruction = read_model(str(binary))
+    assert reconstruction.num_reg_images() == 12 and reconstruction.num_points3D() == 30
+    assert_same(reconstruction, pycolmap.Reconstruction(binary))
+    assert_same(reconstruction, read_model(text))
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".txt"])
+def test_reads_colmap_3(tmp_path: Path, binary: Path, text: Path, suffix: str) -> None:
+    for name in THREE:
+        shutil.copy((binary if suffix == ".bin" else text) / (name + suffix), tmp_path)
+    reconstruction = read_model(tmp_path)
+    assert reconstruction.num_rigs() == 4 and reconstruction.num_frames() == 12
+    expected = pycolmap.Reconstruction(binary)
+    for i, image in reconstruction.images.items():
+        assert np.allclose(image.cam_from_world().matrix(), expected.images[i].cam_from_world().matrix(), atol=1e-12)
+
+
+def test_prefers_binary(model: Path) -> None:
+    for name in THREE:
+        (model / f"{name}.txt").write_text("not a model\n")
+    assert read_model(model).num_reg_images() == 12
+
+
+def test_reading_alters_nothing(model: Path) -> None:
+    before = snapshot(model)
+    read_model(model)
+    assert snapshot(model) == before
+
+
+def test_names_with_spaces_survive_in_text(tmp_path: Path) -> None:
+    # pycolmap cuts them at the first space.
+    reconstruction = synthesize()
+    names = {1: "dive 1/left cam.png", 2: "dive 1/プール 2.png"}
+    for i, name in names.items():
+        reconstruction.images[i].name = name
+    reconstruction.write_text(tmp_path)
+    read = read_model(tmp_path)
+    assert {i: read.images[i].name for i in names} == names
+
+
+def test_path_with_any_characters(tmp_path: Path, binary: Path) -> None:
+    folder = Path(shutil.copytree(binary, tmp_path / "プール é 1"))
+    assert read_model(folder).num_reg_images() == 12
+
+
+def test_says_what_is_missing(tmp_path: Path, model: Path) -> None:
+    assert "does not exist" in error_of(lambda: read_model(tmp_path / "nowhere"))
+    assert "is a file" in error_of(lambda: read_model(model / "cameras.bin"))
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert "holds no COLMAP model" in error_of(lambda: read_model(empty))
+    (model / "points3D.bin").unlink()
+    message = error_of(lambda: read_model(model))
+    assert "only cameras.bin, images.bin" in message and "add the missing files" in message
+
+
+@pytest.mark.parametrize("inside", ["0", "sparse/0", "sparse"])
+def test_hints_at_a_model_inside(tmp_path: Path, binary: Path, inside: str) -> None:
+    shutil.copytree(binary, tmp_path / "project" / inside)
+    message = error_of(lambda: read_model(tmp_path / "project"))
+    assert message.endswith(f"did you mean {tmp_path / 'project' / inside}?")
+
+
+@pytest.mark.parametrize("name", ["rigs", "frames"])
+def test_rigs_without_frames(model: Path, name: str) -> None:
+    (model / f"{name}.bin").unlink()
+    assert f"{name}.bin is missing" in error_of(lambda: read_model(model))
+
+
+def test_unreadable_file(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(self: Path) -> bytes:
+        raise PermissionError(errno.EACCES, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "read_bytes", refuse)
+    message = error_of(lambda: read_model(model))
+    assert message == f"cannot read {model / 'cameras.bin'}: Permission denied"
+
+
+@pytest.mark.parametrize("name", FIVE)
+def test_every_truncation_of_a_binary_file_is_an_error(model: Path, name: str) -> None:
+    file = model / f"{name}.bin"
+    data = file.read_bytes()
+    step = max(1, len(data) // 150)
+    for size in [*range(0, len(data), step), len(data) - 1]:
+        file.write_bytes(data[:size])
+        assert f"{name}.bin" in error_of(lambda: read_model(model)), size
+    file.write_bytes(data + b"\0")
+    assert f"{name}.bin: 1 bytes follow" in error_of(lambda: read_model(model))
+
+
+@pytest.mark.parametrize("name", FIVE)
+@pytest.mark.parametrize("suffix", [".bin", ".txt"])
+def test_altered_bytes_give_a_model_or_an_error(
+    tmp_path: Path, binary: Path, text: Path, name: str, suffix: str
+) -> None:
+    """That nothing else happens is all this shows: most bytes are of coordinates, and those cannot be checked."""
+    folder = Path(shutil.copytree(binary if suffix == ".bin" else text, tmp_path / "altered"))
+    file = folder / (name + suffix)
+    data = file.read_bytes()
+    rng = np.random.default_rng(0)
+    read = 0
+    for _ in range(150):
+        content = bytearray(data)
+        at = int(rng.integers(min(len(data), rng.choice([40, 400, 10**9]))))
+        match rng.integers(4):
+            case 0:
+                content[at] ^= 1 << int(rng.integers(8))
+            case 1:
+                content[at] = int(rng.integers(256))
+            case 2:
+                content[at : at + 8] = rng.choice([b"\xff" * 8, b"\x01" * 8, b"        "])
+            case _:
+                del content[at:]
+        file.write_bytes(content)
+        try:
+            reconstruction = read_model(folder)
+        except RefractError:
+            continue
+        read += 1
+        assert reconstruction.is_valid()
+        assert all(np.isfinite(p.xyz).all() for p in reconstruction.points3D.values())
+    assert read < 150
+
+
+NAN = struct.pack("<d", np.nan)
+INFINITE = struct.pack("<d", np.inf)
+HUGE = struct.pack("<Q", 2**62)
+FRAME, IMAGE, POINT = 8 + 8, 8, 8  # where the pose, the first image and the first point begin
+
+
+@pytest.mark.parametrize(
+    ("name", "at", "data", "expected"),
+    [
+        ("cameras", 0, HUGE, "ends inside entry 5"),
+        ("cameras", 0, bytes(8), "bytes follow"),
+        ("cameras", 12, struct.pack("<i", 77), "has the model 77, which pycolmap"),
+        ("cameras", 16, bytes(8), "impossible image size"),
+        ("cameras", 32, NAN, "camera 1 has a parameter that is not finite"),
+        ("cameras", 32, struct.pack("<d", -1.0), "focal length that is not positive"),
+        ("cameras", 8, struct.pack("<I", 2), "camera id occurs twice"),
+        ("cameras", 8, struct.pack("<I", 9), "has camera 1, which is not in cameras.bin"),
+        ("frames", FRAME, INFINITE, "frames.bin or rigs.bin: the pose of image"),
+        ("frames", FRAME, bytes(32), "not a unit quaternion"),
+        ("frames", 8 + 4, struct.pack("<I", 99), "rigs.bin or frames.bin is damaged or of another model"),
+        ("frames", 8 + 64, b"\xff" * 4, "ends inside entry 1"),
+        ("rigs", 12, b"\xff" * 4, "ends inside entry 1"),
+        ("rigs", 8 + 24 + 1, NAN, "frames.bin or rigs.bin: the pose of image"),
+        ("images", IMAGE, struct.pack("<I", 2), "image id occurs twice"),
+        ("images", IMAGE + 60, struct.pack("<I", 9), "has camera 9, which is not in cameras.bin"),
+        ("images", IMAGE + 64, b"\xe4", "name of image 1 is not UTF-8"),
+        ("points3D", POINT, struct.pack("<Q", 2), "point id is invalid or occurs twice"),
+        ("points3D", POINT + 8, NAN, "point 1 is not finite"),
+        ("points3D", POINT + 43, HUGE, "ends inside entry 1 of 30"),
+        ("points3D", POINT + 51, struct.pack("<I", 99), "of image 99, an image that does not exist"),
+        ("points3D", POINT + 55, struct.pack("<I", 9999), "at keypoint 9999 of image 1, which does not exist"),
+    ],
+)
+def test_damage_is_named(model: Path, name: str, at: int, data: bytes, expected: str) -> None:
+    patch(model / f"{name}.bin", at, data)
+    assert expected in error_of(lambda: read_model(model))
+
+
+def keypoint_at(reconstruction: pycolmap.Reconstruction, point2D_idx: int) -> int:
+    """Where a keypoint of the first image is in images.bin."""
+    return IMAGE + 64 + len(reconstruction.images[1].name) + 1 + 8 + 24 * point2D_idx
+
+
+def test_keypoints_and_tracks_must_agree(model: Path) -> None:
+    reconstruction = pycolmap.Reconstruction(model)
+    file = model / "images.bin"
+    has_point = [p.has_point3D() for p in reconstruction.images[1].points2D]
+    free, used = has_point.index(False), has_point.index(True)
+    clean = file.read_bytes()
+
+    for point3D_id in (999999, 7):
+        patch(file, keypoint_at(reconstruction, free) + 16, struct.pack("<Q", point3D_id))
+        assert f"belongs to point {point3D_id}, whose track in points3D.bin" in error_of(lambda: read_model(model))
+    file.write_bytes(clean)
+    patch(file, keypoint_at(reconstruction, used) + 16, b"\xff" * 8)
+    assert "belongs to another point or none" in error_of(lambda: read_model(model))
+    file.write_bytes(clean)
+    patch(file, keypoint_at(reconstruction, used), NAN)
+    assert f"keypoint {used} of image" in error_of(lambda: read_model(model))
+    file.write_bytes(clean)
+    patch(file, keypoint_at(reconstruction, free), NAN)
+    assert read_model(model).num_reg_images() == 12, "a keypoint without a point is of no consequence"
+
+
+def test_images_of_one_name(model: Path) -> None:
+    reconstruction = pycolmap.Reconstruction(model)
+    reconstruction.images[2].name = reconstruction.images[1].name
+    reconstruction.write(model)
+    assert "are both called" in error_of(lambda: read_model(model))
+
+
+def test_nothing_registered_and_no_points(tmp_path: Path, model: Path) -> None:
+    reconstruction = pycolmap.Reconstruction(model)
+    reconstruction.delete_all_points2D_and_points3D()
+    reconstruction.write(model)
+    assert "no points" in error_of(lambda: read_model(model))
+    for frame_id in reconstruction.reg_frame_ids():
+        reconstruction.deregister_frame(frame_id)
+    reconstruction.write(model)
+    assert "no image is registered" in error_of(lambda: read_model(model))
+
+
+def test_frame_with_an_image_that_is_gone(model: Path) -> None:
+    reconstruction = pycolmap.Reconstruction(model)
+    reconstruction.deregister_frame(6)
+    frames = (model / "frames.bin").read_bytes()
+    reconstruction.write(model)
+    (model / "frames.bin").write_bytes(frames)
+    assert re.search("image 1[12] in frame 6 does not exist", error_of(lambda: read_model(model)))
+
+
+@pytest.mark.parametrize("name", THREE)
+def test_truncated_text_is_an_error(text_model: Path, name: str) -> None:
+    file = text_model / f"{name}.txt"
+    data = file.read_bytes()
+    # Behind the last space but one only digits can be lost, which nobody can see.
+    whole = data.rstrip().rindex(b" ")
+    for size in range(0, whole, max(1, whole // 100)):
+        file.write_bytes(data[:size])
+        message = error_of(lambda: read_model(text_model))
+        assert f"{name}.txt" in message or "images.txt" in message, size
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "1e400", "12abc"])
+def test_numbers_in_text(text_model: Path, value: str) -> None:
+    # pycolmap drops the keypoints from there on without a word.
+    lines = (text_model / "images.txt").read_text().split("\n")
+    lines[5] = value + lines[5][lines[5].index(" ") :]
+    (text_model / "images.txt").write_text("\n".join(lines))
+    assert "images.txt: line 6 has" in error_of(lambda: read_model(text_model))
+
+
+def test_text_that_means_something_else_to_pycolmap(text_model: Path) -> None:
+    # A number for Python, not for C++, which drops the keypoints from there on.
+    lines = (text_model / "images.txt").read_text().split("\n")
+    lines[5] += " 1_0 2 -1"
+    (text_model / "images.txt").write_text("\n".join(lines))
+    assert "reads only a part" in error_of(lambda: read_model(text_model))
+
+
+def test_colmap_logs_nothing(model: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    level = pycolmap.logging.minloglevel
+    test_frame_with_an_image_that_is_gone(model)
+    with model_io._quiet_pycolmap():
+        pycolmap.logging.error("unheard")
+    pycolmap.logging.error("heard")
+    assert pycolmap.logging.minloglevel == level
+    err = capfd.readouterr().err
+    assert err.count("\n") == 1 and err.endswith("heard\n") and "unheard" not in err
+
+
+# --------------------------------------------------------------------------- cameras
+
+
+@given(
+    model=st.sampled_from([m for m in pycolmap.CameraModelId.__members__.values() if int(m) >= 0]),
+    width=st.integers(1, 10000),
+    height=st.integers(1, 10000),
+    data=st.data(),
+)
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_cameras_round_trip(
+    tmp_path: Path, model: pycolmap.CameraModelId, width: int, height: int, data: st.DataObject
+) -> None:
+    camera = pycolmap.Camera.create_from_model_id(3, model, 1000.0, width, height)
+    floats = st.floats(1e-300, 1e300)
+    camera.params = data.draw(st.lists(floats, min_size=len(camera.params), max_size=len(camera.params)))
+    reconstruction = pycolmap.Reconstruction()
+    reconstruction.add_camera(camera)
+    reconstruction.write_binary(tmp_path)
+    reconstruction.write_text(tmp_path)
+    for file in (tmp_path / "cameras.bin", tmp_path / "cameras.txt", tmp_path):
+        cameras = read_cameras(file)
+        assert list(cameras) == [3]
+        assert cameras[3].model == model and (cameras[3].width, cameras[3].height) == (width, height)
+        assert (cameras[3].params == camera.params).all()
+
+
+def test_read_cameras_by_hand(tmp_path: Path) -> None:
+    file = tmp_path / "air.txt"
+    file.write_bytes(b"\xef\xbb\xbf# in air\r\n\r\n 2  PINHOLE 640 480 500 500.5\t320 240 \r\n")
+    assert read_cameras(str(file))[2].params_to_string() == "500, 500.5, 320, 240"
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("", "no camera"),
+        ("1 PINHOLE 640", "line 1 is not 'CAMERA_ID"),
+        ("1 PINHOLE 640 480 500 x 320 240", "line 1 is not 'CAMERA_ID"),
+        ("1 PINHOLE 640.5 480 500 500 320 240", "line 1 is not 'CAMERA_ID"),
+        ("1 PINHOLE 640 480 500 320 240", "has 3 parameters, PINHOLE needs fx, fy, cx, cy"),
+        ("1 PINE 640 480 500 320 240", "model 'PINE', which pycolmap"),
+        ("1 INVALID 640 480", "model 'INVALID', which pycolmap"),
+        ("-1 PINHOLE 640 480 500 500 320 240", "no valid id"),
+        ("1 PINHOLE 0 480 500 500 320 240", "impossible image size"),
+        ("1 PINHOLE 640 480 500 nan 320 240", "not finite"),
+        ("1 PINHOLE 640 480 0 500 320 240", "focal length"),
+        ("1 SIMPLE_PINHOLE 9 9 9 9 9\n1 SIMPLE_PINHOLE 9 9 9 9 9", "occurs twice"),
+    ],
+)
+def test_read_cameras_says_what_is_wrong(tmp_path: Path, line: str, expected: str) -> None:
+    file = tmp_path / "cameras.txt"
+    file.write_text(line + "\n")
+    message = error_of(lambda: read_cameras(file))
+    assert expected in message and str(file) in message
+
+
+def test_read_cameras_without_a_file(tmp_path: Path) -> None:
+    assert "does not exist" in error_of(lambda: read_cameras(tmp_path / "none.txt"))
+    assert "neither cameras.bin nor cameras.txt" in error_of(lambda: read_cameras(tmp_path))
+    (tmp_path / "photo.txt").write_bytes(b"\x89PNG\xff")
+    assert "not UTF-8" in error_of(lambda: read_cameras(tmp_path / "photo.txt"))
+
+
+# --------------------------------------------------------------------------- copying and writing
+
+
+def test_copy_shares_nothing(binary: Path) -> None:
+    reconstruction = read_model(binary)
+    copy = copy_model(reconstruction)
+    assert_same(copy, reconstruction)
+    image = copy.images[1]
+    copy.cameras[image.camera_id].params = [1.0, 2.0, 3.0, 0.0]
+    copy.frames[image.frame_id].rig_from_world = pycolmap.Rigid3d()
+    copy.points3D[1].xyz = np.zeros(3)
+    image.points2D[0].xy = np.zeros(2)
+    image.name = "other"
+    copy.delete_point3D(2)
+    assert image.camera is not None and list(image.camera.params) == [1, 2, 3, 0]
+    assert (image.cam_from_world().translation == 0).all()
+    assert_same(reconstruction, read_model(binary))
+
+
+@pytest.mark.parametrize("form", ["binary", "text"])
+def test_write_round_trip(tmp_path: Path, binary: Path, text: Path, form: str) -> None:
+    reconstruction = read_model(binary if form == "binary" else text)
+    write_model(reconstruction, tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted(f"{name}.bin" for name in FIVE)
+    if form == "binary":
+        assert snapshot(tmp_path) == snapshot(binary)
+    assert_same(read_model(tmp_path), reconstruction)
+
+
+def test_written_model_has_only_registered_images(tmp_path: Path, binary: Path) -> None:
+    reconstruction = read_model(binary)
+    reconstruction.deregister_frame(1)
+    write_model(reconstruction, tmp_path)
+    assert read_model(tmp_path).num_reg_images() == 10
+    assert copy_model(reconstruction).num_images() == 12
+
+
+@contextmanager
+def file_size_limit(size: int) -> Iterator[None]:
+    """The nearest to a full disk that needs no privileges."""
+    resource = pytest.importorskip("resource")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("size", [0, 100, 3000, 10000])
+def test_full_disk_is_found_out(tmp_path: Path, binary: Path, size: int) -> None:
+    # pycolmap itself says nothing.
+    reconstruction = read_model(binary)
+    output = tmp_path / "output"
+
+    def write() -> None:
+        with file_size_limit(size), output_folder(output, input_path=binary, overwrite=False) as folder:
+            write_model(reconstruction, folder)
+
+    assert "is the disk full?" in error_of(write)
+    assert not list(tmp_path.iterdir())
+
+
+def test_write_to_nowhere(tmp_path: Path, binary: Path) -> None:
+    assert "cannot write" in error_of(lambda: write_model(read_model(binary), tmp_path / "none"))
+
+
+# --------------------------------------------------------------------------- the output folder
+
+
+def fill(folder: Path) -> None:
+    (folder / "cameras.bin").write_bytes(b"new")
+    (folder / "refraction.json").write_bytes(b"new sidecar")
+
+
+def write_to(path: Path, overwrite: bool = False, input_path: Path | None = None) -> None:
+    with output_folder(path, input_path=input_path, overwrite=overwrite) as folder:
+        assert not list(folder.iterdir())
+        fill(folder)
+
+
+NEW = {"cameras.bin": b"new", "refraction.json": b"new sidecar"}
+OLD = {
+    "cameras.bin": b"old",
+    "rigs.bin": b"old rigs",
+    "images.txt": b"stale",
+    "refraction.json": b"old sidecar",
+    "notes.txt": b"foreign",
+    "images/1.png": b"foreign too",
+}
+FOREIGN = {"notes.txt": b"foreign", "images/1.png": b"foreign too"}
+
+
+@pytest.fixture
+def old(tmp_path: Path) -> Path:
+    """An earlier output, with files of the user among it."""
+    folder = tmp_path / "out"
+    for name, data in OLD.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(data)
+    return folder
+
+
+def test_new_folder(tmp_path: Path) -> None:
+    path = tmp_path / "a" / "b" / "out"
+    write_to(path)
+    assert snapshot(tmp_path) == {f"a/b/out/{name}": data for name, data in NEW.items()}
+    umask = os.umask(0)
+    os.umask(umask)
+    assert path.stat().st_mode & 0o777 == 0o777 & ~umask
+
+
+def test_empty_folder(tmp_path: Path) -> None:
+    write_to(tmp_path)
+    assert snapshot(tmp_path) == NEW
+
+
+def test_nothing_is_visible_before_the_end(tmp_path: Path, old: Path) -> None:
+    with output_folder(tmp_path / "new", input_path=None, overwrite=False) as folder:
+        fill(folder)
+        assert not (tmp_path / "new").exists()
+    with output_folder(old, input_path=None, overwrite=True) as folder:
+        fill(folder)
+        assert {name: (old / name).read_bytes() for name in OLD} == OLD
+
+
+def test_existing_model_needs_overwrite(old: Path) -> None:
+    assert "is not empty" in error_of(lambda: write_to(old))
+    assert snapshot(old) == OLD
+
+
+def test_overwrite_keeps_foreign_files_and_drops_stale_ones(old: Path) -> None:
+    write_to(old, overwrite=True)
+    assert snapshot(old) == NEW | FOREIGN
+    write_to(old, overwrite=True)
+    assert snapshot(old) == NEW | FOREIGN
+
+
+@pytest.mark.parametrize("exception", [ValueError, KeyboardInterrupt, SystemExit, RefractError])
+@pytest.mark.parametrize("exists", [True, False])
+def test_exception_in_the_block_leaves_everything(
+    tmp_path: Path, old: Path, exception: type[BaseException], exists: bool
+) -> None:
+    path = old if exists else tmp_path / "a" / "b"
+    with pytest.raises(exception), output_folder(path, input_path=None, overwrite=True) as folder:
+        fill(folder)
+        raise exception("stop")
+    assert snapshot(tmp_path) == {f"out/{name}": data for name, data in OLD.items()}
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize("exception", [OSError(errno.EIO, "Input/output error"), KeyboardInterrupt()])
+@pytest.mark.parametrize("call", range(6))
+def test_failing_exchange_puts_everything_back(
+    tmp_path: Path, old: Path, monkeypatch: pytest.MonkeyPatch, exception: BaseException, call: int
+) -> None:
+    replace, calls = os.replace, iter(range(100))
+
+    def fail_once(source: Path, destination: Path) -> None:
+        if next(calls) == call:
+            raise exception
+        replace(source, destination)
+
+    monkeypatch.setattr(os, "replace", fail_once)
+    expected = KeyboardInterrupt if isinstance(exception, KeyboardInterrupt) else RefractError
+    with pytest.raises(expected):
+        write_to(old, overwrite=True)
+    assert next(calls) > call
+    assert snapshot(tmp_path) == {f"out/{name}": data for name, data in OLD.items()}
+    assert sorted(p.name for p in old.iterdir()) == sorted({name.split("/")[0] for name in OLD})
+
+
+def test_what_cannot_be_put_back_is_kept(tmp_path: Path, old: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    replace, calls = os.replace, iter(range(100))
+
+    def fail(source: Path, destination: Path) -> None:
+        if next(calls) >= 2:
+            raise OSError(errno.EIO, "Input/output error")
+        replace(source, destination)
+
+    monkeypatch.setattr(os, "replace", fail)
+    error_of(lambda: write_to(old, overwrite=True))
+    assert sorted(snapshot(old).values()) == sorted(OLD.values())
+
+
+def test_output_is_the_input(tmp_path: Path, old: Path) -> None:
+    link = tmp_path / "link"
+    link.symlink_to(old, target_is_directory=True)
+    for path in (old, link, old / ".." / "out", old / "images" / ".."):
+        assert "is the input" in error_of(partial(write_to, path, overwrite=True, input_path=old))
+        assert "is the input" in error_of(partial(write_to, old, overwrite=True, input_path=path))
+    assert snapshot(old) == OLD
+
+
+def test_output_inside_and_around_the_input(tmp_path: Path) -> None:
+    source = tmp_path / "sparse" / "0"
+    source.mkdir(parents=True)
+    (source / "cameras.bin").write_bytes(b"input")
+    write_to(source / "refined", input_path=source)
+    assert snapshot(source) == {"cameras.bin": b"input"} | {f"refined/{name}": data for name, data in NEW.items()}
+    write_to(tmp_path / "sparse", overwrite=True, input_path=source)
+    assert (source / "cameras.bin").read_bytes() == b"input"
+
+
+def test_output_through_a_link(tmp_path: Path, old: Path) -> None:
+    link = tmp_path / "link"
+    link.symlink_to(old, target_is_directory=True)
+    write_to(link, overwrite=True)
+    assert link.is_symlink() and snapshot(old) == NEW | FOREIGN
+
+
+def test_output_is_a_file(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.write_text("x")
+    assert "is a file" in error_of(lambda: write_to(file, overwrite=True))
+    assert "cannot write" in error_of(lambda: write_to(file / "below", overwrite=True))
+    assert snapshot(tmp_path) == {"file": b"x"}
+
+
+def test_folder_in_the_place_of_a_file(old: Path) -> None:
+    (old / "points3D.bin").mkdir()
+    assert "points3D.bin is a folder" in error_of(lambda: write_to(old, overwrite=True))
+    assert snapshot(old) == OLD
+
+
+@pytest.mark.parametrize("exists", [True, False])
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EROFS, errno.ENOSPC])
+def test_unwritable_parent(
+    tmp_path: Path, old: Path, monkeypatch: pytest.MonkeyPatch, exists: bool, number: int
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "mkdir", refuse)
+    path = old if exists else tmp_path / "new"
+    message = error_of(lambda: write_to(path, overwrite=True))
+    assert message.startswith(f"cannot write to {path}: {os.strerror(number)}")
+
+
+def test_disk_errors_in_the_block(old: Path) -> None:
+    def write(error: OSError) -> None:
+        with output_folder(old, input_path=None, overwrite=True) as folder:
+            if error.filename:
+                error.filename = str(folder / error.filename)
+            raise error
+
+    assert "No space left" in error_of(lambda: write(OSError(errno.ENOSPC, "No space left on device")))
+    assert "Permission" in error_of(lambda: write(PermissionError(errno.EACCES, "Permission denied", "x.json")))
+    with pytest.raises(FileNotFoundError):
+        write(FileNotFoundError(errno.ENOENT, "No such file"))
+    assert snapshot(old) == OLD
+
+
+def test_disk_that_reports_only_on_sync(old: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    assert "No space left" in error_of(lambda: write_to(old, overwrite=True))
+    assert snapshot(old) == OLD
+
+
+def test_leftovers_of_a_killed_run_do_not_count(tmp_path: Path) -> None:
+    (tmp_path / f"{model_io.WORK_PREFIX}0123").mkdir()
+    write_to(tmp_path)
+    assert snapshot(tmp_path) == NEW
