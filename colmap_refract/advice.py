@@ -21,7 +21,7 @@ _OBLIQUE_DEG = 8.0
 
 @dataclass(frozen=True, kw_only=True)
 class Facts:
-    """What is known after a solve; errors in px, noise in px of one coordinate."""
+    """What is known after a solve; errors in px, noise in px of one coordinate, and whether intrinsics from air were given."""
 
     arrangement: Arrangement
     problem: Problem
@@ -29,6 +29,7 @@ class Facts:
     uncertainty: Uncertainty
     noise: float
     pinhole_errors: Array
+    calibrated: bool
     errors: Array
 
 
@@ -53,7 +54,7 @@ def _solver(facts: Facts) -> list[str]:
 
 
 def _intrinsics(facts: Facts) -> list[str]:
-    if facts.arrangement.options.cameras or not facts.problem.held.lens:
+    if facts.calibrated or not facts.problem.held.lens:
         return []
     sentences = []
     suspicious = []

@@ -13,7 +13,7 @@ from colmap_refract.elimination import Tracks
 from colmap_refract.errors import RefractError
 from colmap_refract.interface import Array, Layers
 from colmap_refract.observations import Observations, lens_jacobian
-from colmap_refract.options import RefinerOptions, Scenario
+from colmap_refract.options import ImageNotes, RefinerOptions, Scenario
 from colmap_refract.scenario import Index, State, Structure, share_planes
 from colmap_refract.start import image_depths, start_planes
 
@@ -64,6 +64,14 @@ class Arrangement:
         return options.layers.scaled(ratio / options.interface_distance)
 
     @property
+    def normal(self) -> Array | None:
+        """The unit normal that the options give, in the camera's frame."""
+        if self.options.interface_normal is None:
+            return None
+        normal = np.array(self.options.interface_normal, dtype=np.float64)
+        return np.asarray(normal / np.linalg.norm(normal))
+
+    @property
     def ratio(self) -> float | None:
         """Interface distance over median depth, where the options say it."""
         options = self.options
@@ -82,10 +90,7 @@ class Arrangement:
             A problem in which every observation of an image with an interface is taken to be wet.
         """
         options, structure = self.options, self.structure
-        known = None if options.interface_normal is None else np.array(options.interface_normal, dtype=np.float64)
-        if known is not None:
-            known = known / np.linalg.norm(known)
-        normal, distance = start_planes(self.observations, structure, ratio, known, self.reference)
+        normal, distance = start_planes(self.observations, structure, ratio, self.normal, self.reference)
         if not options.refine_interface_distance:
             rotation, translation = self.observations.cam_from_world
             centers = -np.einsum("nji,nj->ni", rotation, translation)
@@ -135,7 +140,7 @@ class Arrangement:
         )
 
 
-def arrange(observations: Observations, options: RefinerOptions) -> Arrangement:
+def arrange(observations: Observations, options: RefinerOptions, notes: ImageNotes) -> Arrangement:
     """Tie the images of a model according to the scenario, in units of the solve.
 
     Raises:
@@ -143,14 +148,14 @@ def arrange(observations: Observations, options: RefinerOptions) -> Arrangement:
             for the unknowns, or options that do not fit the model.
     """
     names = observations.image_names
-    _check_names(names, options)
-    reference = _reference_image(observations, options)
-    dry = [name in options.dry_images for name in names]
+    _check_names(names, options, notes)
+    reference = _reference_image(observations, options, notes)
+    dry = [name in notes.dry_images for name in names]
     if all(dry):
         raise RefractError("every image is listed as dry: nothing is refracted; use pycolmap.bundle_adjustment")
     if dry[reference]:
         raise RefractError(f"the reference image '{names[reference]}' is listed as dry: name one with an interface")
-    groups = [options.interface_groups.get(name) for name in names]
+    groups = [notes.interface_groups.get(name) for name in names]
     scenario = options.scenario
     image_plane, in_world, plane_names = share_planes(
         scenario, observations.image_frame.tolist(), observations.image_camera.tolist(), groups, dry
@@ -216,27 +221,27 @@ def min_num_points(scenario: Scenario, num_images: int) -> int:
     return -(-unknowns // (2 * num_images - 3))
 
 
-def _check_names(names: list[str], options: RefinerOptions) -> None:
+def _check_names(names: list[str], options: RefinerOptions, notes: ImageNotes) -> None:
     known = set(names)
-    mentioned = [("dry_images", n) for n in sorted(options.dry_images)]
-    mentioned += [("interface_groups", n) for n in options.interface_groups]
+    mentioned = [("dry_images", n) for n in sorted(notes.dry_images)]
+    mentioned += [("interface_groups", n) for n in notes.interface_groups]
     mentioned += [("reference_image", options.reference_image)] if options.reference_image else []
     for what, name in mentioned:
         if name not in known:
             raise RefractError(
                 f"{what}: there is no registered image named '{name}' in the model; its images are named like '{names[0]}'"
             )
-    both = sorted(set(options.interface_groups) & options.dry_images)
+    both = sorted(set(notes.interface_groups) & notes.dry_images)
     if both:
-        raise RefractError(f"image '{both[0]}' is listed as dry and in group '{options.interface_groups[both[0]]}'")
+        raise RefractError(f"image '{both[0]}' is listed as dry and in group '{notes.interface_groups[both[0]]}'")
 
 
-def _reference_image(observations: Observations, options: RefinerOptions) -> int:
+def _reference_image(observations: Observations, options: RefinerOptions, notes: ImageNotes) -> int:
     if options.reference_image:
         return observations.image_names.index(options.reference_image)
     counts = np.bincount(observations.image, minlength=len(observations.image_ids)).astype(np.float64)
     for i, name in enumerate(observations.image_names):
-        if name in options.dry_images:
+        if name in notes.dry_images:
             counts[i] = -1
     return int(counts.argmax())
 
@@ -264,7 +269,7 @@ def _check_counts(
 def _fix_camera(observations: Observations, reference: int) -> tuple[Observations, Index]:
     """One pose per rig: the reference image's, and for further rigs that of their first frame.
 
-    Points are put at their depth from that pose along the mean direction they are seen in, since poses
+    Points are put at their depth from that pose along the median direction they are seen in, since poses
     that a mapper made up for a camera that did not move have put them anywhere.
     """
     frames = observations.image_frame
@@ -283,8 +288,9 @@ def _fix_camera(observations: Observations, reference: int) -> tuple[Observation
     image = fixed.image
     centers = -np.einsum("nji,nj->ni", rotation, translation)
     ray = np.einsum("nji,nj->ni", rotation[image], fixed.direction)
-    mean = np.add.reduceat(ray, fixed.start[:-1], axis=0)
-    mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-12)[:, None]
+    # A median, since one wrong match would pull a mean far off.
+    middle = np.stack([segment_median(ray[:, j], fixed.start) for j in range(3)], axis=1)
+    middle /= np.maximum(np.linalg.norm(middle, axis=1), 1e-12)[:, None]
     # Depths are the input's own, seen from where it had its cameras.
     old_rotation, old_translation = observations.cam_from_world
     old_centers = -np.einsum("nji,nj->ni", old_rotation, old_translation)
@@ -294,7 +300,15 @@ def _fix_camera(observations: Observations, reference: int) -> tuple[Observation
     if not typical > 0:
         raise RefractError("the points lie at the projection centre; give the model a depth (any constant will do)")
     away = np.clip(away, 0.3 * typical, 3.0 * typical)
-    return replace(fixed, points=centers[first] + away[:, None] * mean), frame_pose
+    return replace(fixed, points=centers[first] + away[:, None] * middle), frame_pose
+
+
+def segment_median(values: Array, start: Index) -> Array:
+    """Median (P,) of each run of `values` between successive entries of `start`."""
+    segment = np.repeat(np.arange(len(start) - 1), np.diff(start))
+    order = np.lexsort((values, segment))
+    low, high = start[:-1] + (np.diff(start) - 1) // 2, start[:-1] + np.diff(start) // 2
+    return np.asarray(0.5 * (values[order[low]] + values[order[high]]))
 
 
 def _to_solve_units(observations: Observations, reference: int) -> tuple[Observations, Array, float]:

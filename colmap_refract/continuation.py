@@ -16,12 +16,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from colmap_refract import elimination
-from colmap_refract.adjustment import Adjustment, Problem, Progress, SolverSettings, adjust
+from colmap_refract.adjustment import (
+    Adjustment,
+    Problem,
+    Progress,
+    SolverSettings,
+    adjust,
+    robust_cost,
+    settle_points,
+)
 from colmap_refract.arrangement import Arrangement, select_tracks
 from colmap_refract.filtering import label_wet, noise
 from colmap_refract.interface import Array
+from colmap_refract.options import Loss
 from colmap_refract.scenario import Change, evaluate_views
-from colmap_refract.start import world_plane
+from colmap_refract.start import start_planes, world_plane
 from colmap_refract.triangulation import triangulate
 
 logger = logging.getLogger(__name__)
@@ -30,7 +39,7 @@ Watch = Callable[[str, Progress], None]
 
 _TRACKS_PER_IMAGE = 60
 _WIDE_LOSS = 4.0
-"""Least scale, px, of the Huber loss on the way."""
+"""Least scale, px, of the Cauchy loss on the way."""
 _ANCHORS = (1e6, 1.0, 1e-2, 1e-4, 0.0)
 """Proximal weights, in units of a point's own curvature, for a camera that does not move."""
 _OPEN_RATIOS = (0.5, 0.15)
@@ -84,34 +93,88 @@ def find_start(arrangement: Arrangement, settings: SolverSettings, watch: Watch 
 def _try(
     arrangement: Arrangement, problem: Problem, ratio: float, settings: SolverSettings, watch: Watch | None
 ) -> Start | None:
+    """Follow one start distance to its minimum: planes held, then free; None where no way was found."""
     on_progress = named(watch, f"Start at {ratio:.3g} of the depth")
-    quick = replace(settings, max_num_iterations=min(25, settings.max_num_iterations), function_tolerance=1e-3)
-    through = replace(settings, max_num_iterations=min(60, settings.max_num_iterations), function_tolerance=1e-6)
-    problem = _widened(problem)
-    everything = replace(
+    settings = replace(settings, max_num_iterations=min(60, settings.max_num_iterations), function_tolerance=1e-6)
+    if arrangement.options.scenario == "fixed_camera":
+        return _fixed_camera(problem, ratio, settings, on_progress)
+    if arrangement.options.scenario == "moving_interface":
+        problem = _from_common_plane(arrangement, problem, ratio, settings, on_progress) or problem
+    elif not _stands(problem):
+        unbent = _unbend(problem, ratio, settings, on_progress)
+        if unbent is None:
+            return None
+        problem = unbent
+    return _settle_and_free(problem, ratio, settings, on_progress)
+
+
+def _settle_and_free(
+    problem: Problem, ratio: float, settings: SolverSettings, on_progress: Callable[[Progress], None] | None
+) -> Start | None:
+    """Solve behind planes that stand still, then with everything free."""
+    held = replace(
         problem.held,
         normals=np.ones_like(problem.held.normals),
         distances=np.ones_like(problem.held.distances),
         index=True,
         lens=True,
     )
-    if arrangement.options.scenario == "fixed_camera":
-        return _fixed_camera(arrangement, problem, ratio, through, on_progress)
-    if not _stands(problem):
-        unbent = _unbend(arrangement, problem, ratio, quick, on_progress)
-        if unbent is None:
-            return None
-        problem = unbent
-    else:
-        settled = adjust(replace(problem, held=everything), quick, on_progress=on_progress)
-        if settled.termination != "failure":
-            problem = replace(problem, state=settled.state, points=settled.points)
-    problem = _widened(problem)
-    freed = adjust(problem, through, on_progress=on_progress)
-    return _start(arrangement, problem, ratio, freed)
+    quick = replace(settings, max_num_iterations=min(25, settings.max_num_iterations), function_tolerance=1e-3)
+    problem = _widened(retriangulate(_widened(problem), settings))
+    settled = adjust(replace(problem, held=held), quick, on_progress=on_progress)
+    if settled.termination != "failure":
+        problem = _widened(replace(problem, state=settled.state, points=settled.points))
+    return _start(problem, ratio, adjust(problem, settings, on_progress=on_progress))
 
 
-def _start(arrangement: Arrangement, problem: Problem, ratio: float, adjustment: Adjustment) -> Start | None:
+def _from_common_plane(
+    arrangement: Arrangement,
+    problem: Problem,
+    ratio: float,
+    settings: SolverSettings,
+    on_progress: Callable[[Progress], None] | None,
+) -> Problem | None:
+    """A start for planes of their own: all images share one for a while.
+
+    Moving interfaces scatter about one plane of the world more often than not (water is level on average), and
+    an image's own plane, let loose at once, can run into its camera.
+    """
+    structure = problem.structure
+    wet = structure.image_plane >= 0
+    common = replace(
+        structure,
+        image_plane=np.where(wet, 0, -1),
+        plane_in_world=np.ones(1, dtype=np.bool_),
+        plane_anchor=np.zeros((1, 3)),
+    )
+    normal, distance = start_planes(arrangement.observations, common, ratio, arrangement.normal, arrangement.reference)
+    free = np.zeros(1, dtype=np.bool_)
+    tied = replace(
+        problem,
+        structure=common,
+        state=replace(problem.state, normal=normal, distance=distance),
+        held=replace(problem.held, normals=free, distances=free, index=True, lens=True),
+    )
+    if not _stands(tied):
+        return None
+    solved = _settle_and_free(tied, ratio, settings, on_progress)
+    if solved is None or not solved.sound:
+        return None
+    state = solved.problem.state
+    cam_normal, cam_distance = state.planes_in_cam(common)
+    normal, distance = problem.state.normal.copy(), problem.state.distance.copy()
+    for block in range(structure.num_planes):
+        image = int(np.flatnonzero(structure.image_plane == block)[0])
+        normal[block], distance[block] = cam_normal[image], cam_distance[image]
+        if structure.plane_in_world[block]:
+            normal[block] = state.normal[0]
+            distance[block] = state.distance[0] - state.normal[0] @ structure.plane_anchor[block]
+    normal = np.where(problem.held.normals[:, None], problem.state.normal, normal)
+    distance = np.where(problem.held.distances, problem.state.distance, distance)
+    return replace(problem, state=replace(state, normal=normal, distance=distance), points=solved.problem.points)
+
+
+def _start(problem: Problem, ratio: float, adjustment: Adjustment) -> Start | None:
     if not np.isfinite(adjustment.cost) or adjustment.cost < 0:
         return None
     problem = replace(problem, state=adjustment.state, points=adjustment.points)
@@ -132,10 +195,29 @@ def _stands(problem: Problem) -> bool:
     return bool((distance[np.isfinite(distance)] > 0.0).all())
 
 
-def _widened(problem: Problem) -> Problem:
-    """The problem under a Huber loss wide enough for its residuals as they are."""
+def retriangulate(problem: Problem, settings: SolverSettings) -> Problem:
+    """The problem with each point at the better of two minima: from where it is, and from where its rays meet.
+
+    A robust cost has several minima; wrong matches, and positions from another geometry, lead to the wrong one.
+    """
+    if problem.held.points:
+        return problem
+    layers = problem.layers.with_index(problem.state.index)
+    meeting = triangulate(problem.tracks, problem.structure, problem.state, layers, problem.points)
+    points, costs = [], []
+    for start in (problem.points, meeting):
+        candidate = replace(problem, points=start)
+        candidate = replace(candidate, points=settle_points(candidate, settings))
+        squared = (residuals(candidate) ** 2).sum(axis=1)
+        costs.append(np.add.reduceat(robust_cost(squared, problem.loss, problem.loss_scale), problem.tracks.start[:-1]))
+        points.append(candidate.points)
+    return replace(problem, points=np.where((costs[0] <= costs[1])[:, None], points[0], points[1]))
+
+
+def _widened(problem: Problem, loss: Loss = "cauchy") -> Problem:
+    """The problem under a loss wide enough for its residuals as they are."""
     spread = float(np.median(np.linalg.norm(residuals(problem), axis=1)))
-    return replace(problem, loss="huber", loss_scale=max(_WIDE_LOSS, 3.0 * spread) if np.isfinite(spread) else 100.0)
+    return replace(problem, loss=loss, loss_scale=max(_WIDE_LOSS, 3.0 * spread) if np.isfinite(spread) else 100.0)
 
 
 def residuals(problem: Problem) -> Array:
@@ -150,7 +232,6 @@ def residuals(problem: Problem) -> Array:
 
 
 def _unbend(
-    arrangement: Arrangement,
     problem: Problem,
     ratio: float,
     settings: SolverSettings,
@@ -173,8 +254,10 @@ def _unbend(
         problem.state, normal=np.tile([0.0, 0.0, 1.0], (count, 1)), distance=np.full(count, ratio)
     )
     held = replace(problem.held, normals=np.zeros(count, bool), distances=np.zeros(count, bool), index=True, lens=True)
-    loose = _widened(replace(problem, structure=own, state=state, held=held))
-    adjusted = adjust(loose, settings, on_progress=on_progress)
+    own_planes = replace(problem, structure=own, state=state, held=held)
+    loose = _widened(retriangulate(_widened(own_planes), settings))
+    quick = replace(settings, max_num_iterations=25, function_tolerance=1e-4)
+    adjusted = adjust(loose, quick, on_progress=on_progress)
     if adjusted.termination == "failure":
         return None
     rotation, translation = adjusted.state.cam_from_world(own)
@@ -195,7 +278,6 @@ def _unbend(
 
 
 def _fixed_camera(
-    arrangement: Arrangement,
     problem: Problem,
     ratio: float,
     settings: SolverSettings,
@@ -204,13 +286,15 @@ def _fixed_camera(
     """Proximal continuation: equal planes give a fixed camera no parallax, so each point is tied to where it was, ever less."""
     adjusted = None
     for weight in _ANCHORS:
+        # At first whole images are far off, by their planes' tilt, and no outliers: they must not lose their weight.
+        problem = _widened(problem, "huber" if weight >= 1.0 else "cauchy")
         curvature = _curvature(problem)
         adjusted = adjust(problem, settings, anchor_weights=weight * curvature, on_progress=on_progress)
         if adjusted.termination == "failure":
             return None
         problem = replace(problem, state=adjusted.state, points=adjusted.points)
     assert adjusted is not None
-    return _start(arrangement, problem, ratio, adjusted)
+    return _start(problem, ratio, adjusted)
 
 
 def _curvature(problem: Problem) -> Array:
@@ -223,15 +307,12 @@ def _curvature(problem: Problem) -> Array:
     return np.asarray(np.add.reduceat(each, problem.tracks.start[:-1]) / 3.0)
 
 
-def spread_out(arrangement: Arrangement, start: Start) -> Problem:
-    """All observations, from a start that was found on a few: points are triangulated from the refracted rays."""
+def spread_out(arrangement: Arrangement, start: Start, settings: SolverSettings) -> Problem:
+    """All observations, from a start that was found on a few; the other points go where their rays meet."""
     problem = arrangement.start(start.ratio, arrangement.observations)
     problem = replace(problem, state=start.problem.state, layers=start.problem.layers)
-    if arrangement.held.points:
-        return problem
-    layers = problem.layers.with_index(problem.state.index)
-    points = triangulate(problem.tracks, problem.structure, problem.state, layers, problem.points)
-    return replace(problem, points=points)
+    problem = replace(problem, loss="cauchy", loss_scale=_WIDE_LOSS)
+    return retriangulate(problem, settings)
 
 
 def estimate_noise(problem: Problem) -> float:

@@ -4,20 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
 from colmap_refract.errors import RefractError
 from colmap_refract.interface import Layers
 
-if TYPE_CHECKING:
-    import pycolmap
-
 Scenario = Literal["moving_interface", "static_interface", "fixed_camera", "camera_housing"]
 Loss = Literal["trivial", "huber", "soft_l1", "cauchy"]
-
-NUM_FILTER_ROUNDS = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +37,16 @@ class BundleAdjustmentOptions:
     """Of the solver, each time it runs."""
     function_tolerance: float = 1e-9
     """Relative change of the cost at which the solver stops."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageNotes:
+    """What is known of single images, by name."""
+
+    interface_groups: Mapping[str, str] = field(default_factory=dict)
+    """Image name to group name: the images of a group are known to share one interface."""
+    dry_images: frozenset[str] = frozenset()
+    """Images taken without any interface."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,18 +84,12 @@ class RefinerOptions:
     reference_image: str = ""
     """Name of the image that interface_distance and interface_normal speak of, and whose pose a fixed
     camera keeps. By default the one with most observations."""
-    interface_groups: Mapping[str, str] = field(default_factory=dict)
-    """Image name to group name: the images of a group are known to share one interface."""
-    dry_images: frozenset[str] = frozenset()
-    """Names of images taken without any interface."""
-    cameras: Mapping[int, pycolmap.Camera] = field(default_factory=dict)
-    """Intrinsics calibrated in air by camera id, in place of the model's. Key 0 stands for every camera."""
 
     filter_max_reproj_error: float = 4.0
     """Observations with a larger refractive reprojection error, px, are removed. 0: keep all."""
     filter_min_tri_angle: float | None = None
     """Points whose refracted rays meet at a smaller angle, degrees, are removed. By default 0.5, and
-    0 with a fixed camera, whose rays differ by refraction only."""
+    0.05 with a fixed camera, whose rays differ by refraction only. 0: keep all."""
 
     BundleAdjustment: BundleAdjustmentOptions = BundleAdjustmentOptions()
     num_threads: int = -1
@@ -143,4 +142,4 @@ class RefinerOptions:
         """`filter_min_tri_angle` with its default."""
         if self.filter_min_tri_angle is not None:
             return self.filter_min_tri_angle
-        return 0.0 if self.scenario == "fixed_camera" else 0.5
+        return 0.05 if self.scenario == "fixed_camera" else 0.5

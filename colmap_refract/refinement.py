@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -14,13 +15,13 @@ from colmap_refract.adjustment import Adjustment, Problem, SolverSettings, adjus
 from colmap_refract.advice import Facts, advise
 from colmap_refract.alignment import Similarity, align_poses, rescale_about
 from colmap_refract.arrangement import Arrangement, arrange
-from colmap_refract.continuation import Watch, named, estimate_noise, find_start, is_sound, spread_out
+from colmap_refract.continuation import Watch, named, estimate_noise, find_start, is_sound, retriangulate, spread_out
 from colmap_refract.errors import RefractError
 from colmap_refract.filtering import filter_observations, label_wet, pinhole_errors, reprojection_errors
 from colmap_refract.interface import Array, plane_in_cam
 from colmap_refract.model_io import copy_model
-from colmap_refract.observations import Observations, lift, read_observations
-from colmap_refract.options import NUM_FILTER_ROUNDS, RefinerOptions
+from colmap_refract.observations import lift, read_observations
+from colmap_refract.options import ImageNotes, RefinerOptions
 from colmap_refract.scenario import State
 from colmap_refract.sidecar import ImageInterface, Sidecar, WorldPlane
 from colmap_refract.uncertainty import Uncertainty, estimate_uncertainty
@@ -33,6 +34,7 @@ logger = logging.getLogger(__name__)
 LOSS_SCALE_IN_NOISE = 4.0
 """Of the default loss: wide enough to lose nothing on Gaussian noise, narrow enough to stop a wrong match."""
 _LEAST_LOSS_SCALE = 1.0
+_NUM_FILTER_ROUNDS = 3
 _NEGLIGIBLE_CHANGE = 1e-3
 """Part of the observations whose removal or relabelling is not worth another solve."""
 
@@ -65,13 +67,21 @@ class _Counts:
 
 
 def refine(
-    reconstruction: pycolmap.Reconstruction, options: RefinerOptions, *, watch: Watch | None = None
+    reconstruction: pycolmap.Reconstruction,
+    options: RefinerOptions,
+    *,
+    notes: ImageNotes | None = None,
+    cameras: Mapping[int, pycolmap.Camera] | None = None,
+    watch: Watch | None = None,
 ) -> Refinement:
     """Refine a model whose images were taken through plane interfaces.
 
     Args:
         reconstruction: a COLMAP model that ignored refraction; not altered.
         options: the scenario, what is known and what is held.
+        notes: which images share an interface, and which have none.
+        cameras: intrinsics calibrated in air by camera id, in place of the model's. A single camera
+            stands for all of the model's, whatever its id.
         watch: called with the stage's name and the solver's progress after every iteration.
 
     Returns:
@@ -82,15 +92,16 @@ def refine(
         KeyboardInterrupt: Ctrl-C during a solve; nothing has been changed.
     """
     started = perf_counter()
+    notes = notes or ImageNotes()
     model = copy_model(reconstruction)
     _check_model(model)
     original = read_observations(model)
-    _replace_cameras(model, options)
+    _replace_cameras(model, cameras or {})
     observations = read_observations(model)
     if not len(observations.points):
         raise RefractError("the model has no point that two registered images see: there is nothing to refine")
     before = pinhole_errors(original)
-    arrangement = arrange(observations, options)
+    arrangement = arrange(observations, options, notes)
     counts = _Counts(unusable=model.compute_num_observations() - len(observations.image))
     num_threads = options.num_threads if options.num_threads > 0 else len(os.sched_getaffinity(0))
     settings = SolverSettings(
@@ -114,12 +125,13 @@ def refine(
         uncertainty=uncertainty,
         noise=noise,
         pinhole_errors=before,
+        calibrated=bool(cameras),
         errors=errors,
     )
     warnings = advise(facts)
     to_output = _output_frame(arrangement, problem.state, problem.points)
     _write_back(model, arrangement, problem, errors, to_output)
-    sidecar = _sidecar(arrangement, problem, adjustment, uncertainty, noise, to_output, warnings)
+    sidecar = _sidecar(arrangement, notes, problem, adjustment, uncertainty, noise, to_output, warnings)
     sidecar.statistics.update(
         _statistics(reconstruction, model, before, errors, counts, problem, noise, solve_seconds, perf_counter() - started)
     )
@@ -146,17 +158,17 @@ def _check_model(model: pycolmap.Reconstruction) -> None:
             raise RefractError(f"frame {frame_id} has a pose that is not finite: deregister it")
 
 
-def _replace_cameras(model: pycolmap.Reconstruction, options: RefinerOptions) -> None:
+def _replace_cameras(model: pycolmap.Reconstruction, cameras: Mapping[int, pycolmap.Camera]) -> None:
     """In-air intrinsics in place of the model's: keypoints are raw pixels, so that is sound."""
+    if not cameras:
+        return
     for camera_id, camera in model.cameras.items():
-        known = options.cameras.get(camera_id, options.cameras.get(0))
+        known = next(iter(cameras.values())) if len(cameras) == 1 else cameras.get(camera_id)
         if known is None:
-            if options.cameras:
-                raise RefractError(
-                    f"the given intrinsics have no camera {camera_id}, which the model uses; they have "
-                    f"{', '.join(str(i) for i in sorted(options.cameras))}"
-                )
-            continue
+            raise RefractError(
+                f"the given intrinsics have no camera {camera_id}, which the model uses; they have "
+                f"{', '.join(str(i) for i in sorted(cameras))}"
+            )
         if (known.width, known.height) != (camera.width, camera.height):
             raise RefractError(
                 f"camera {camera_id} takes images of {camera.width} x {camera.height} px, the given intrinsics are for "
@@ -173,14 +185,14 @@ def _solve(
     """Start, solve, filter and solve again, until nothing more is removed."""
     options = arrangement.options
     start = find_start(arrangement, settings, watch)
-    problem = _with_loss(arrangement, spread_out(arrangement, start), estimate_noise(start.problem))
+    problem = _with_loss(arrangement, spread_out(arrangement, start, settings), estimate_noise(start.problem))
     coarse = replace(settings, function_tolerance=max(1e-5, settings.function_tolerance))
     adjustment = adjust(problem, coarse, on_progress=named(watch, "Refractive bundle adjustment"))
     problem = replace(problem, state=adjustment.state, points=adjustment.points)
     if not is_sound(problem):
         _raise_unsound(problem)
-    for round_ in range(NUM_FILTER_ROUNDS + 1):
-        arrangement, problem = _filter(arrangement, problem, counts)
+    for round_ in range(_NUM_FILTER_ROUNDS + 1):
+        arrangement, problem = _filter(arrangement, problem, settings, counts)
         stage = "Refractive bundle adjustment" + (f", filtered {round_ + 1}x" if round_ else "")
         problem = _with_loss(arrangement, problem, estimate_noise(problem))
         adjustment = adjust(problem, settings, on_progress=named(watch, stage))
@@ -189,7 +201,7 @@ def _solve(
         if not (moved or _would_change(arrangement, problem)):
             break
     # The last few outliers say too little to solve everything again for: their points alone are settled anew.
-    arrangement, problem = _filter(arrangement, problem, counts)
+    arrangement, problem = _filter(arrangement, problem, settings, counts)
     problem = replace(problem, points=settle_points(problem, settings))
     if not is_sound(problem):
         _raise_unsound(problem)
@@ -220,9 +232,13 @@ def _would_change(arrangement: Arrangement, problem: Problem) -> bool:
     return bool(max(relabelled, removed) > _NEGLIGIBLE_CHANGE)
 
 
-def _filter(arrangement: Arrangement, problem: Problem, counts: _Counts) -> tuple[Arrangement, Problem]:
+def _filter(
+    arrangement: Arrangement, problem: Problem, settings: SolverSettings, counts: _Counts
+) -> tuple[Arrangement, Problem]:
     """Label wet and dry anew, remove outliers, and count them."""
-    problem = replace(problem, tracks=problem.tracks._replace(wet=label_wet(problem)))
+    wet = label_wet(problem)
+    if (wet != problem.tracks.wet).any():
+        problem = retriangulate(replace(problem, tracks=problem.tracks._replace(wet=wet)), settings)
     marks = _marks(arrangement, problem)
     if marks.keep.all():
         return arrangement, problem
@@ -346,6 +362,7 @@ def _write_back(
 
 def _sidecar(
     arrangement: Arrangement,
+    notes: ImageNotes,
     problem: Problem,
     adjustment: Adjustment,
     uncertainty: Uncertainty,
@@ -384,10 +401,9 @@ def _sidecar(
         )
     metric = arrangement.options.interface_distance is not None
     length = "metre" if metric else "unit of the input model"
-    options = asdict(replace(arrangement.options, cameras={}))
-    options["dry_images"] = sorted(arrangement.options.dry_images)
-    options["interface_groups"] = dict(arrangement.options.interface_groups)
-    del options["cameras"]
+    options = asdict(arrangement.options)
+    options["dry_images"] = sorted(notes.dry_images)
+    options["interface_groups"] = dict(notes.interface_groups)
     return Sidecar(
         scenario=arrangement.options.scenario,
         layers=layers,

@@ -15,7 +15,7 @@ change of the blocks into what the kernel needs, with its derivative.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import get_args
 
@@ -253,8 +253,3 @@ def share_planes(
         in_world[block] = scenario == "static_interface" or (scenario != "camera_housing" and len(images) > 1)
         names.append(str(key[1]) if isinstance(key, tuple) and key[0] == "group" else None)
     return image_plane, in_world, names
-
-
-def group_by_name(names: Sequence[str], groups: Mapping[str, str]) -> list[str | None]:
-    """The group of each image, or None."""
-    return [groups.get(name) for name in names]

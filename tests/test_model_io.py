@@ -1,26 +1,23 @@
-"""Models survive reading and writing; damaged ones, and disks that fail, give one clear line and do no harm."""
+"""Models survive reading and writing; damaged ones, and disks that are full, give one clear line and do no harm."""
 
 from __future__ import annotations
 
 import errno
-import os
 import re
 import shutil
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from colmap_refract import model_io
 from colmap_refract.errors import RefractError
-from colmap_refract.model_io import copy_model, output_folder, read_cameras, read_model, write_model
+from colmap_refract.model_io import copy_model, read_model, write_model
+from colmap_refract.output import output_folder
 
 THREE = ("cameras", "images", "points3D")
 FIVE = (*THREE, "rigs", "frames")
@@ -92,9 +89,6 @@ def assert_same(a: pycolmap.Reconstruction, b: pycolmap.Reconstruction) -> None:
         assert np.array_equal([p.xy for p in image.points2D], [p.xy for p in other.points2D])
     for i, point in a.points3D.items():
         assert np.array_equal(point.xyz, b.points3D[i].xyz) and point.track.length() == b.points3D[i].track.length()
-
-
-# --------------------------------------------------------------------------- reading
 
 
 def test_reads_binary_and_text_alike(binary: Path, text: Path) -> None:
@@ -353,73 +347,6 @@ def test_colmap_logs_nothing(model: Path, capfd: pytest.CaptureFixture[str]) -> 
     assert err.count("\n") == 1 and err.endswith("heard\n") and "unheard" not in err
 
 
-# --------------------------------------------------------------------------- cameras
-
-
-@given(
-    model=st.sampled_from([m for m in pycolmap.CameraModelId.__members__.values() if int(m) >= 0]),
-    width=st.integers(1, 10000),
-    height=st.integers(1, 10000),
-    data=st.data(),
-)
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_cameras_round_trip(
-    tmp_path: Path, model: pycolmap.CameraModelId, width: int, height: int, data: st.DataObject
-) -> None:
-    camera = pycolmap.Camera.create_from_model_id(3, model, 1000.0, width, height)
-    floats = st.floats(1e-300, 1e300)
-    camera.params = data.draw(st.lists(floats, min_size=len(camera.params), max_size=len(camera.params)))
-    reconstruction = pycolmap.Reconstruction()
-    reconstruction.add_camera(camera)
-    reconstruction.write_binary(tmp_path)
-    reconstruction.write_text(tmp_path)
-    for file in (tmp_path / "cameras.bin", tmp_path / "cameras.txt", tmp_path):
-        cameras = read_cameras(file)
-        assert list(cameras) == [3]
-        assert cameras[3].model == model and (cameras[3].width, cameras[3].height) == (width, height)
-        assert (cameras[3].params == camera.params).all()
-
-
-def test_read_cameras_by_hand(tmp_path: Path) -> None:
-    file = tmp_path / "air.txt"
-    file.write_bytes(b"\xef\xbb\xbf# in air\r\n\r\n 2  PINHOLE 640 480 500 500.5\t320 240 \r\n")
-    assert read_cameras(str(file))[2].params_to_string() == "500, 500.5, 320, 240"
-
-
-@pytest.mark.parametrize(
-    ("line", "expected"),
-    [
-        ("", "no camera"),
-        ("1 PINHOLE 640", "line 1 is not 'CAMERA_ID"),
-        ("1 PINHOLE 640 480 500 x 320 240", "line 1 is not 'CAMERA_ID"),
-        ("1 PINHOLE 640.5 480 500 500 320 240", "line 1 is not 'CAMERA_ID"),
-        ("1 PINHOLE 640 480 500 320 240", "has 3 parameters, PINHOLE needs fx, fy, cx, cy"),
-        ("1 PINE 640 480 500 320 240", "model 'PINE', which pycolmap"),
-        ("1 INVALID 640 480", "model 'INVALID', which pycolmap"),
-        ("-1 PINHOLE 640 480 500 500 320 240", "no valid id"),
-        ("1 PINHOLE 0 480 500 500 320 240", "impossible image size"),
-        ("1 PINHOLE 640 480 500 nan 320 240", "not finite"),
-        ("1 PINHOLE 640 480 0 500 320 240", "focal length"),
-        ("1 SIMPLE_PINHOLE 9 9 9 9 9\n1 SIMPLE_PINHOLE 9 9 9 9 9", "occurs twice"),
-    ],
-)
-def test_read_cameras_says_what_is_wrong(tmp_path: Path, line: str, expected: str) -> None:
-    file = tmp_path / "cameras.txt"
-    file.write_text(line + "\n")
-    message = error_of(lambda: read_cameras(file))
-    assert expected in message and str(file) in message
-
-
-def test_read_cameras_without_a_file(tmp_path: Path) -> None:
-    assert "does not exist" in error_of(lambda: read_cameras(tmp_path / "none.txt"))
-    assert "neither cameras.bin nor cameras.txt" in error_of(lambda: read_cameras(tmp_path))
-    (tmp_path / "photo.txt").write_bytes(b"\x89PNG\xff")
-    assert "not UTF-8" in error_of(lambda: read_cameras(tmp_path / "photo.txt"))
-
-
-# --------------------------------------------------------------------------- copying and writing
-
-
 def test_copy_shares_nothing(binary: Path) -> None:
     reconstruction = read_model(binary)
     copy = copy_model(reconstruction)
@@ -482,204 +409,3 @@ def test_full_disk_is_found_out(tmp_path: Path, binary: Path, size: int) -> None
 
 def test_write_to_nowhere(tmp_path: Path, binary: Path) -> None:
     assert "cannot write" in error_of(lambda: write_model(read_model(binary), tmp_path / "none"))
-
-
-# --------------------------------------------------------------------------- the output folder
-
-
-def fill(folder: Path) -> None:
-    (folder / "cameras.bin").write_bytes(b"new")
-    (folder / "refraction.json").write_bytes(b"new sidecar")
-
-
-def write_to(path: Path, overwrite: bool = False, input_path: Path | None = None) -> None:
-    with output_folder(path, input_path=input_path, overwrite=overwrite) as folder:
-        assert not list(folder.iterdir())
-        fill(folder)
-
-
-NEW = {"cameras.bin": b"new", "refraction.json": b"new sidecar"}
-OLD = {
-    "cameras.bin": b"old",
-    "rigs.bin": b"old rigs",
-    "images.txt": b"stale",
-    "refraction.json": b"old sidecar",
-    "notes.txt": b"foreign",
-    "images/1.png": b"foreign too",
-}
-FOREIGN = {"notes.txt": b"foreign", "images/1.png": b"foreign too"}
-
-
-@pytest.fixture
-def old(tmp_path: Path) -> Path:
-    """An earlier output, with files of the user among it."""
-    folder = tmp_path / "out"
-    for name, data in OLD.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_bytes(data)
-    return folder
-
-
-def test_new_folder(tmp_path: Path) -> None:
-    path = tmp_path / "a" / "b" / "out"
-    write_to(path)
-    assert snapshot(tmp_path) == {f"a/b/out/{name}": data for name, data in NEW.items()}
-    umask = os.umask(0)
-    os.umask(umask)
-    assert path.stat().st_mode & 0o777 == 0o777 & ~umask
-
-
-def test_empty_folder(tmp_path: Path) -> None:
-    write_to(tmp_path)
-    assert snapshot(tmp_path) == NEW
-
-
-def test_nothing_is_visible_before_the_end(tmp_path: Path, old: Path) -> None:
-    with output_folder(tmp_path / "new", input_path=None, overwrite=False) as folder:
-        fill(folder)
-        assert not (tmp_path / "new").exists()
-    with output_folder(old, input_path=None, overwrite=True) as folder:
-        fill(folder)
-        assert {name: (old / name).read_bytes() for name in OLD} == OLD
-
-
-def test_existing_model_needs_overwrite(old: Path) -> None:
-    assert "is not empty" in error_of(lambda: write_to(old))
-    assert snapshot(old) == OLD
-
-
-def test_overwrite_keeps_foreign_files_and_drops_stale_ones(old: Path) -> None:
-    write_to(old, overwrite=True)
-    assert snapshot(old) == NEW | FOREIGN
-    write_to(old, overwrite=True)
-    assert snapshot(old) == NEW | FOREIGN
-
-
-@pytest.mark.parametrize("exception", [ValueError, KeyboardInterrupt, SystemExit, RefractError])
-@pytest.mark.parametrize("exists", [True, False])
-def test_exception_in_the_block_leaves_everything(
-    tmp_path: Path, old: Path, exception: type[BaseException], exists: bool
-) -> None:
-    path = old if exists else tmp_path / "a" / "b"
-    with pytest.raises(exception), output_folder(path, input_path=None, overwrite=True) as folder:
-        fill(folder)
-        raise exception("stop")
-    assert snapshot(tmp_path) == {f"out/{name}": data for name, data in OLD.items()}
-    assert [p.name for p in tmp_path.iterdir()] == ["out"]
-
-
-@pytest.mark.parametrize("exception", [OSError(errno.EIO, "Input/output error"), KeyboardInterrupt()])
-@pytest.mark.parametrize("call", range(6))
-def test_failing_exchange_puts_everything_back(
-    tmp_path: Path, old: Path, monkeypatch: pytest.MonkeyPatch, exception: BaseException, call: int
-) -> None:
-    replace, calls = os.replace, iter(range(100))
-
-    def fail_once(source: Path, destination: Path) -> None:
-        if next(calls) == call:
-            raise exception
-        replace(source, destination)
-
-    monkeypatch.setattr(os, "replace", fail_once)
-    expected = KeyboardInterrupt if isinstance(exception, KeyboardInterrupt) else RefractError
-    with pytest.raises(expected):
-        write_to(old, overwrite=True)
-    assert next(calls) > call
-    assert snapshot(tmp_path) == {f"out/{name}": data for name, data in OLD.items()}
-    assert sorted(p.name for p in old.iterdir()) == sorted({name.split("/")[0] for name in OLD})
-
-
-def test_what_cannot_be_put_back_is_kept(tmp_path: Path, old: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    replace, calls = os.replace, iter(range(100))
-
-    def fail(source: Path, destination: Path) -> None:
-        if next(calls) >= 2:
-            raise OSError(errno.EIO, "Input/output error")
-        replace(source, destination)
-
-    monkeypatch.setattr(os, "replace", fail)
-    error_of(lambda: write_to(old, overwrite=True))
-    assert sorted(snapshot(old).values()) == sorted(OLD.values())
-
-
-def test_output_is_the_input(tmp_path: Path, old: Path) -> None:
-    link = tmp_path / "link"
-    link.symlink_to(old, target_is_directory=True)
-    for path in (old, link, old / ".." / "out", old / "images" / ".."):
-        assert "is the input" in error_of(partial(write_to, path, overwrite=True, input_path=old))
-        assert "is the input" in error_of(partial(write_to, old, overwrite=True, input_path=path))
-    assert snapshot(old) == OLD
-
-
-def test_output_inside_and_around_the_input(tmp_path: Path) -> None:
-    source = tmp_path / "sparse" / "0"
-    source.mkdir(parents=True)
-    (source / "cameras.bin").write_bytes(b"input")
-    write_to(source / "refined", input_path=source)
-    assert snapshot(source) == {"cameras.bin": b"input"} | {f"refined/{name}": data for name, data in NEW.items()}
-    write_to(tmp_path / "sparse", overwrite=True, input_path=source)
-    assert (source / "cameras.bin").read_bytes() == b"input"
-
-
-def test_output_through_a_link(tmp_path: Path, old: Path) -> None:
-    link = tmp_path / "link"
-    link.symlink_to(old, target_is_directory=True)
-    write_to(link, overwrite=True)
-    assert link.is_symlink() and snapshot(old) == NEW | FOREIGN
-
-
-def test_output_is_a_file(tmp_path: Path) -> None:
-    file = tmp_path / "file"
-    file.write_text("x")
-    assert "is a file" in error_of(lambda: write_to(file, overwrite=True))
-    assert "cannot write" in error_of(lambda: write_to(file / "below", overwrite=True))
-    assert snapshot(tmp_path) == {"file": b"x"}
-
-
-def test_folder_in_the_place_of_a_file(old: Path) -> None:
-    (old / "points3D.bin").mkdir()
-    assert "points3D.bin is a folder" in error_of(lambda: write_to(old, overwrite=True))
-    assert snapshot(old) == OLD
-
-
-@pytest.mark.parametrize("exists", [True, False])
-@pytest.mark.parametrize("number", [errno.EACCES, errno.EROFS, errno.ENOSPC])
-def test_unwritable_parent(
-    tmp_path: Path, old: Path, monkeypatch: pytest.MonkeyPatch, exists: bool, number: int
-) -> None:
-    def refuse(*_: object, **__: object) -> None:
-        raise OSError(number, os.strerror(number))
-
-    monkeypatch.setattr(os, "mkdir", refuse)
-    path = old if exists else tmp_path / "new"
-    message = error_of(lambda: write_to(path, overwrite=True))
-    assert message.startswith(f"cannot write to {path}: {os.strerror(number)}")
-
-
-def test_disk_errors_in_the_block(old: Path) -> None:
-    def write(error: OSError) -> None:
-        with output_folder(old, input_path=None, overwrite=True) as folder:
-            if error.filename:
-                error.filename = str(folder / error.filename)
-            raise error
-
-    assert "No space left" in error_of(lambda: write(OSError(errno.ENOSPC, "No space left on device")))
-    assert "Permission" in error_of(lambda: write(PermissionError(errno.EACCES, "Permission denied", "x.json")))
-    with pytest.raises(FileNotFoundError):
-        write(FileNotFoundError(errno.ENOENT, "No such file"))
-    assert snapshot(old) == OLD
-
-
-def test_disk_that_reports_only_on_sync(old: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(_: int) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full)
-    assert "No space left" in error_of(lambda: write_to(old, overwrite=True))
-    assert snapshot(old) == OLD
-
-
-def test_leftovers_of_a_killed_run_do_not_count(tmp_path: Path) -> None:
-    (tmp_path / f"{model_io.WORK_PREFIX}0123").mkdir()
-    write_to(tmp_path)
-    assert snapshot(tmp_path) == NEW

@@ -1,0 +1,146 @@
+"""The output folder: a model appears in it whole or not at all."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from uuid import uuid4
+
+from colmap_refract.errors import RefractError
+from colmap_refract.model_files import MODEL_FILES
+from colmap_refract.sidecar import SIDECAR_NAME
+
+# What a folder that we write to must not keep of an earlier run.
+OWN_FILES = (*MODEL_FILES, SIDECAR_NAME)
+WORK_PREFIX = ".colmap_refract-"  # of the temporary folders of `output_folder`
+# The user's to put right, wherever in the block they turn up.
+DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
+
+
+@contextmanager
+def output_folder(path: str | Path, *, input_path: str | Path | None, overwrite: bool) -> Iterator[Path]:
+    """A temporary folder whose files appear in `path` all together, and only if the block ends without an exception.
+
+    A `path` that does not exist is made by one rename. In a folder that exists, the files of the old model are moved
+    aside before the new ones are moved in, so that no reader ever finds a mixture, and deleted at last;
+    until then whatever goes wrong puts them back. Files that are not of a model stay where they are; a model in
+    the other form (`.txt`) goes, for readers would take it or be confused.
+
+    Args:
+        path: folder to be written; its parents are made as needed.
+        input_path: folder of the model that is being refined, which must not be altered.
+        overwrite: whether a folder that is not empty may be written to.
+
+    Yields:
+        An empty folder on the same disk.
+
+    Raises:
+        RefractError: `path` is the input, is a file, is not empty without `overwrite`, or cannot be written to. In
+            the block: the disk is full.
+    """
+    path = Path(path)
+    try:
+        target = path.resolve()  # through a link, which stays
+        _check_output(path, target, input_path, overwrite)
+        missing = [parent for parent in target.parents if not parent.exists()]
+    except (OSError, RuntimeError) as error:
+        raise _cannot_write(path, error) from error
+    exists = target.is_dir()
+    # Beside or inside the target: the disk is the same, so that files need only be renamed.
+    work = (target if exists else target.parent) / f"{WORK_PREFIX}{uuid4().hex[:12]}"
+    new, old = work / "new", work / "old"
+    done = False
+    try:
+        try:
+            new.mkdir(parents=True)
+        except OSError as error:
+            raise _cannot_write(path, error) from error
+        try:
+            yield new
+        except OSError as error:
+            if error.errno in DISK_ERRORS or str(work) in str(error.filename):
+                raise _cannot_write(path, error) from error
+            raise
+        try:
+            _sync(new)
+            if exists:
+                _exchange(new, target, old)
+            else:
+                os.rename(new, target)
+            done = True
+            _sync_names(target.parent)
+            _sync_names(target)
+        except OSError as error:
+            raise _cannot_write(path, error) from error
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
+        if done:
+            shutil.rmtree(old, ignore_errors=True)
+        # Only what is empty: files that could not be put back are kept in `old`.
+        for folder in [old, work, *([] if done else missing)]:
+            with suppress(OSError):
+                folder.rmdir()
+
+
+def _check_output(path: Path, target: Path, input_path: str | Path | None, overwrite: bool) -> None:
+    if input_path is not None:
+        source = Path(input_path).resolve()
+        if target == source or (target.exists() and source.exists() and target.samefile(source)):
+            raise RefractError(f"the output folder {path} is the input; choose another, the input is never altered")
+    if not target.exists():
+        return
+    if not target.is_dir():
+        raise RefractError(f"the output {path} is a file; choose a folder")
+    # What a killed run left does not count.
+    if not overwrite and any(not inside.name.startswith(WORK_PREFIX) for inside in target.iterdir()):
+        raise RefractError(
+            f"the output folder {path} is not empty; choose another, or have the model in it overwritten (--overwrite)"
+        )
+
+
+def _cannot_write(path: Path, error: Exception) -> RefractError:
+    reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+    return RefractError(f"cannot write to {path}: {reason}; choose another folder, nothing was changed in this one")
+
+
+def _exchange(new: Path, target: Path, old: Path) -> None:
+    """Move the files of an old model in `target` to `old` and those in `new` to `target`, or nothing at all."""
+    entering = sorted(os.listdir(new))
+    moves = [(target / name, old / name) for name in sorted({*entering, *OWN_FILES}) if os.path.lexists(target / name)]
+    for occupied, _ in moves:
+        if occupied.is_dir():
+            raise RefractError(f"{occupied} is a folder where a file is to be written; move it away")
+    moves += [(new / name, target / name) for name in entering]
+    old.mkdir()
+    try:
+        for source, destination in moves:
+            os.replace(source, destination)
+    except BaseException:
+        for source, destination in reversed(moves):
+            # What was moved is put back; what was not has its source still.
+            if not os.path.lexists(source):
+                os.replace(destination, source)
+        raise
+
+
+def _sync(folder: Path) -> None:
+    """Have the disk confirm every file: some report only now that they are full."""
+    for path in folder.rglob("*"):
+        if path.is_file():
+            with path.open("rb+") as file:
+                os.fsync(file.fileno())
+    _sync_names(folder)
+
+
+def _sync_names(folder: Path) -> None:
+    # Not every system lets a folder be opened; the files are safe already.
+    with suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

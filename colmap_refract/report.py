@@ -1,0 +1,141 @@
+"""What was done, in words and numbers for a terminal; everything comes from the sidecar, so it can be said again later."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from colmap_refract.sidecar import ImageInterface, Sidecar
+
+_WIDTH = 78
+_MOST_ROWS = 20
+
+
+def report(sidecar: Sidecar) -> str:
+    """The report of a refinement.
+
+    Args:
+        sidecar: as written beside the model.
+
+    Returns:
+        Lines of text with units, without a final newline.
+    """
+    lines = [_rule(), f"Refractive refinement, {sidecar.scenario}", _rule()]
+    lines += _model(sidecar)
+    lines += ["", *_interfaces(sidecar)]
+    lines += ["", *_solver(sidecar.solver)]
+    warnings = sidecar.solver.get("warnings") or []
+    if warnings:
+        lines += ["", *(f"WARNING: {sentence}" for sentence in warnings)]
+    return "\n".join(lines)
+
+
+def _rule() -> str:
+    return "=" * _WIDTH
+
+
+def _row(label: str, value: str) -> str:
+    return f"{label + ':':34s}{value}"
+
+
+def _model(sidecar: Sidecar) -> list[str]:
+    s = sidecar.statistics
+    before, after = s.get("num_observations_before"), s.get("num_observations")
+    filtered = [
+        (s.get("num_filtered_large_error"), "observations with a large error"),
+        (s.get("num_filtered_small_angle"), "points with a small angle"),
+        (s.get("num_unusable_observations"), "observations that no two images could use"),
+    ]
+    removed = ", ".join(f"{count} {what}" for count, what in filtered if count) or "nothing"
+    lines = [
+        _row("Images", f"{s.get('num_images')} ({s.get('num_reg_images')} registered)"),
+        _row("Points", f"{s.get('num_points3D_before')} before, {s.get('num_points3D')} after"),
+        _row("Observations", f"{before} before, {after} after"),
+        _row("Filtered", removed),
+    ]
+    if s.get("num_dry_observations"):
+        lines.append(_row("Observations of dry points", str(s["num_dry_observations"])))
+    lines += [
+        _row("Mean reprojection error", _errors(s, "mean")),
+        _row("Median reprojection error", _errors(s, "median")),
+        _row("Keypoint noise (1 sigma, per axis)", f" {_number(s.get('noise'))} px"),
+    ]
+    return lines
+
+
+def _errors(statistics: dict[str, Any], kind: str) -> str:
+    pinhole = _number(statistics.get(f"{kind}_pinhole_error_before"))
+    return f"{pinhole} px without refraction, {_number(statistics.get(f'{kind}_reprojection_error'))} px with it"
+
+
+def _interfaces(sidecar: Sidecar) -> list[str]:
+    """A row per interface: the group's images share it."""
+    groups: dict[str, list[ImageInterface]] = {}
+    num_dry = 0
+    for name, image in sidecar.images.items():
+        if image.distance is None:
+            num_dry += 1
+        else:
+            groups.setdefault(image.group or name, []).append(image)
+    metric = sidecar.units.get("distance") == "metre"
+    unit = "m" if metric else "model units"
+    head = f"{'Interface':28s}{'images':>7s}  {'distance [' + unit + ']':28s}{'tilt [deg]':20s}"
+    lines = [head, "-" * _WIDTH]
+    for group, images in list(groups.items())[:_MOST_ROWS]:
+        distances = np.array([image.distance for image in images])
+        tilt = np.degrees(np.arccos(np.clip([(image.normal_in_cam or (0, 0, 1))[2] for image in images], -1.0, 1.0)))
+        lines.append(
+            f"{_short(group, 27):28s}{len(images):7d}  {_range(distances, images[0].distance_std):28s}"
+            f"{_range(tilt, images[0].normal_std_deg):20s}".rstrip()
+        )
+    if len(groups) > _MOST_ROWS:
+        lines.append(f"... and {len(groups) - _MOST_ROWS} more, see refraction.json")
+    if num_dry:
+        lines.append(f"{num_dry} images without an interface")
+    media = ", ".join(
+        f"{_number(t)} {unit} of index {mu:.4g}"
+        for t, mu in zip(sidecar.layers.thickness, sidecar.layers.index, strict=False)
+    )
+    index = f"{sidecar.layers.refractive_index:.5g}"
+    deviation = sidecar.solver.get("refractive_index_std")
+    lines.append(_row("Refractive index", index + (f" +- {_number(deviation)}" if deviation else " (held)")))
+    if media:
+        lines.append(_row("Walls", media))
+    if metric:
+        lines.append(_row("Size", "metres, from interface_distance" + _scale_worth(sidecar)))
+    return lines
+
+
+def _scale_worth(sidecar: Sidecar) -> str:
+    """`sigma(scale) / scale = sigma(d) / d`: what a metric result is worth."""
+    image = sidecar.images.get(str(sidecar.solver.get("reference_image")))
+    if image is None or not image.distance or not image.distance_std:
+        return ""
+    return f", good to {100 * image.distance_std / image.distance:.2g} %"
+
+
+def _solver(solver: dict[str, Any]) -> list[str]:
+    converged = "converged" if solver.get("converged") else "DID NOT CONVERGE"
+    loss = f"{solver.get('loss_function_type')} ({_number(solver.get('loss_function_scale'))} px)"
+    return [
+        _row("Solver", f"{converged} after {solver.get('num_iterations')} iterations"),
+        _row("Termination", str(solver.get("message", "")).strip()),
+        _row("Cost", f"{_number(solver.get('cost'), 6)} px^2, loss {loss}"),
+        _row("Gradient (largest entry)", f"{_number(solver.get('gradient_max_norm'))} px^2 per unit"),
+        _row("Still to gain by Newton's method", f"{_number(solver.get('newton_decrement'))} of the cost"),
+    ]
+
+
+def _range(values: Any, deviation: float | None) -> str:
+    low, high = float(np.min(values)), float(np.max(values))
+    text = _number(low, 4) if high - low <= 1e-3 * max(abs(high), 1e-12) else f"{_number(low, 4)} to {_number(high, 4)}"
+    return text + (f" +- {_number(deviation, 2)}" if deviation is not None else "")
+
+
+def _number(value: Any, digits: int = 3) -> str:
+    return "?" if value is None else f"{value:.{digits}g}"
+
+
+def _short(text: str, length: int) -> str:
+    return text if len(text) <= length else "..." + text[-(length - 3) :]
