@@ -26,7 +26,7 @@ from colmap_refract.adjustment import (
     settle_points,
 )
 from colmap_refract.arrangement import Arrangement, select_tracks
-from colmap_refract.filtering import label_wet, noise
+from colmap_refract.filtering import in_cameras, label_wet, noise
 from colmap_refract.interface import Array
 from colmap_refract.options import Loss
 from colmap_refract.scenario import Change, evaluate_views
@@ -44,6 +44,7 @@ _ANCHORS = (1e6, 1.0, 1e-2, 1e-4, 0.0)
 """Proximal weights, in units of a point's own curvature, for a camera that does not move."""
 _OPEN_RATIOS = (0.5, 0.15)
 _HOUSING_RATIOS = (0.02, 0.2)
+_MAX_TURNS = 3
 MIN_DISTANCE = 1e-4
 """Of the median depth: a plane nearer than this has run into the camera."""
 MIN_WET = 0.05
@@ -124,7 +125,8 @@ def _settle_and_free(
     settled = adjust(replace(problem, held=held), quick, on_progress=on_progress)
     if settled.termination != "failure":
         problem = _widened(replace(problem, state=settled.state, points=settled.points))
-    return _start(problem, ratio, adjust(problem, settings, on_progress=on_progress))
+    freed = adjust(problem, settings, on_progress=on_progress)
+    return _turned_over(problem, ratio, freed, settings, on_progress)
 
 
 def _from_common_plane(
@@ -178,7 +180,61 @@ def _start(problem: Problem, ratio: float, adjustment: Adjustment) -> Start | No
     if not np.isfinite(adjustment.cost) or adjustment.cost < 0:
         return None
     problem = replace(problem, state=adjustment.state, points=adjustment.points)
-    return Start(ratio=ratio, problem=problem, cost=adjustment.cost, sound=is_sound(problem))
+    return Start(ratio=ratio, problem=problem, cost=_wide_cost(problem), sound=is_sound(problem))
+
+
+def _turned_over(
+    problem: Problem,
+    ratio: float,
+    adjustment: Adjustment,
+    settings: SolverSettings,
+    on_progress: Callable[[Progress], None] | None,
+) -> Start | None:
+    """The outcome of an adjustment, with planes that ended behind their points turned over if that is better.
+
+    A tilt shifts an image by about the tilt times the depth of the water: behind the points, with the opposite
+    tilt, a plane imitates the one before them, and the solver may come out on the wrong side.
+    """
+    best = _start(problem, ratio, adjustment)
+    for _ in range(_MAX_TURNS):
+        if best is None:
+            return None
+        mirrored = _mirrored(best.problem)
+        if mirrored is None:
+            return best
+        mirrored = _widened(retriangulate(mirrored, settings))
+        turned = _start(mirrored, ratio, adjust(mirrored, settings, on_progress=on_progress))
+        if turned is None or _wide_cost(turned.problem) >= _wide_cost(best.problem):
+            return best
+        best = turned
+    return best
+
+
+def _mirrored(problem: Problem) -> Problem | None:
+    """Planes that most of their points lie before are mirrored at those; None if there are none, or only such."""
+    structure, state = problem.structure, problem.state
+    points, normals, distances = in_cameras(problem)
+    behind = np.einsum("ni,ni->n", points, normals) - distances - sum(problem.layers.thickness)
+    block = structure.image_plane[problem.tracks.image]
+    median = np.array([np.median(behind[block == b]) if (block == b).any() else 1.0 for b in range(structure.num_planes)])
+    wrong = (median < 0.0) & ~problem.held.normals & ~problem.held.distances
+    if not wrong.any() or wrong.all():
+        return None
+    rotation, _ = state.cam_from_world(structure)
+    to_world = np.array([rotation[int(np.flatnonzero(structure.image_plane == b)[0])].T for b in range(len(wrong))])
+    to_world[structure.plane_in_world] = np.eye(3)
+    in_world = np.einsum("bij,bj->bi", to_world, state.normal)
+    mirrored = 2.0 * in_world[~wrong].mean(axis=0) - in_world
+    mirrored = np.einsum("bji,bj->bi", to_world, mirrored / np.linalg.norm(mirrored, axis=1)[:, None])
+    normal = np.where(wrong[:, None], mirrored, state.normal)
+    distance = np.where(wrong, state.distance + 2.0 * median, state.distance)
+    flipped = replace(problem, state=replace(state, normal=normal, distance=distance))
+    return flipped if _stands(flipped) else None
+
+
+def _wide_cost(problem: Problem) -> float:
+    """The cost at the problem's state, under the same loss whatever it was solved with."""
+    return float(robust_cost((residuals(problem) ** 2).sum(axis=1), "cauchy", _WIDE_LOSS).sum())
 
 
 def is_sound(problem: Problem) -> bool:
@@ -289,12 +345,17 @@ def _fixed_camera(
         # At first whole images are far off, by their planes' tilt, and no outliers: they must not lose their weight.
         problem = _widened(problem, "huber" if weight >= 1.0 else "cauchy")
         curvature = _curvature(problem)
+        if adjusted is None:
+            # Tilts first: they are what moves an image as a whole.
+            level = replace(problem, held=replace(problem.held, distances=np.ones_like(problem.held.distances)))
+            adjusted = adjust(level, settings, anchor_weights=weight * curvature, on_progress=on_progress)
+            problem = _widened(replace(problem, state=adjusted.state, points=adjusted.points), "huber")
         adjusted = adjust(problem, settings, anchor_weights=weight * curvature, on_progress=on_progress)
         if adjusted.termination == "failure":
             return None
         problem = replace(problem, state=adjusted.state, points=adjusted.points)
     assert adjusted is not None
-    return _start(problem, ratio, adjusted)
+    return _turned_over(problem, ratio, adjusted, settings, on_progress)
 
 
 def _curvature(problem: Problem) -> Array:

@@ -7,7 +7,7 @@ The world's z axis points down into the water and its origin is at the height of
 floor lies at about z = `depth` and a level interface at z = `distance`. Lengths are metres.
 """
 
-from colmap_refract.simulation.accuracy import point_rmse
+from colmap_refract.simulation.accuracy import noise_bound, point_rmse
 from colmap_refract.simulation.capture import Capture, ignore_refraction, simulate
 from colmap_refract.simulation.least_path import least_path_direction
 from colmap_refract.simulation.scene import SceneOptions
@@ -17,6 +17,7 @@ __all__ = [
     "SceneOptions",
     "ignore_refraction",
     "least_path_direction",
+    "noise_bound",
     "point_rmse",
     "simulate",
 ]
