@@ -501,6 +501,7 @@ def adjust(
     settings: SolverSettings,
     *,
     anchor_weights: Array | None = None,
+    plane_deviations: tuple[float, float] | None = None,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> Adjustment:
     """Minimise the refractive reprojection error from the problem's start.
@@ -509,6 +510,8 @@ def adjust(
         problem: what to solve.
         settings: of Ceres.
         anchor_weights: (P,) weights of the proximal terms that keep each point near its start.
+        plane_deviations: standard deviations (tilt in radians, distance in units of the solve) of normal priors
+            that keep the planes near their start, for residuals of one px.
         on_progress: called after every iteration, on the calling thread.
 
     Returns:
@@ -528,7 +531,7 @@ def adjust(
     num_slices = max((len(chunk._slices) for chunk in chunks), default=1)
     pool = ThreadPoolExecutor(num_slices) if num_slices > 1 else None
     try:
-        return _solve(problem, settings, chunks, blocks, watch, pool)
+        return _solve(problem, settings, chunks, blocks, watch, pool, plane_deviations)
     finally:
         if pool is not None:
             pool.shutdown()
@@ -541,6 +544,7 @@ def _solve(
     blocks: _Blocks,
     watch: _Watch,
     pool: ThreadPoolExecutor | None,
+    plane_deviations: tuple[float, float] | None,
 ) -> Adjustment:
     ceres = pyceres.Problem()
     costs = [_ReducedCost(chunk, pool, watch) for chunk in chunks]
@@ -558,6 +562,10 @@ def _solve(
     for key in blocks.keys:
         if key[0] != PLANE:
             continue
+        if plane_deviations is not None:
+            tilt, distance = plane_deviations
+            prior = pyceres.factors.NormalPrior(np.zeros(3), np.diag([tilt**2, tilt**2, distance**2]))
+            ceres.add_residual_block(prior, None, [blocks.values[key]])
         fixed = ([0, 1] if problem.held.normals[key[1]] else []) + ([2] if problem.held.distances[key[1]] else [])
         if fixed:
             ceres.set_manifold(blocks.values[key], pyceres.SubsetManifold(3, fixed))

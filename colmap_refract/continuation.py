@@ -42,6 +42,8 @@ _WIDE_LOSS = 4.0
 """Least scale, px, of the Cauchy loss on the way."""
 _ANCHORS = (1e6, 1.0, 1e-2, 1e-4, 0.0)
 """Proximal weights, in units of a point's own curvature, for a camera that does not move."""
+_PLANE_DEVIATIONS = (0.1, 1.0, 10.0)
+"""Of normal priors on moving planes, radians and units of the solve for residuals of one px, let loose in turn."""
 _OPEN_RATIOS = (0.5, 0.15)
 _HOUSING_RATIOS = (0.02, 0.2)
 _MAX_TURNS = 3
@@ -100,7 +102,9 @@ def _try(
     if arrangement.options.scenario == "fixed_camera":
         return _fixed_camera(problem, ratio, settings, on_progress)
     if arrangement.options.scenario == "moving_interface":
-        problem = _from_common_plane(arrangement, problem, ratio, settings, on_progress) or problem
+        common = _from_common_plane(arrangement, problem, ratio, settings, on_progress)
+        if common is not None:
+            return _let_loose(common, ratio, settings, on_progress)
     elif not _stands(problem):
         unbent = _unbend(problem, ratio, settings, on_progress)
         if unbent is None:
@@ -160,7 +164,7 @@ def _from_common_plane(
     if not _stands(tied):
         return None
     solved = _settle_and_free(tied, ratio, settings, on_progress)
-    if solved is None or not solved.sound:
+    if solved is None:
         return None
     state = solved.problem.state
     cam_normal, cam_distance = state.planes_in_cam(common)
@@ -181,6 +185,22 @@ def _start(problem: Problem, ratio: float, adjustment: Adjustment) -> Start | No
         return None
     problem = replace(problem, state=adjustment.state, points=adjustment.points)
     return Start(ratio=ratio, problem=problem, cost=_wide_cost(problem), sound=is_sound(problem))
+
+
+def _let_loose(
+    problem: Problem, ratio: float, settings: SolverSettings, on_progress: Callable[[Progress], None] | None
+) -> Start | None:
+    """Planes freed little by little: a tilt and a turn of the camera look alike in a narrow view, and a plane
+    that is free at once leaves with the one for the other."""
+    for deviation in _PLANE_DEVIATIONS:
+        problem = _widened(problem)
+        adjusted = adjust(problem, settings, plane_deviations=(deviation, deviation), on_progress=on_progress)
+        if adjusted.termination == "failure":
+            return None
+        problem = replace(problem, state=adjusted.state, points=adjusted.points)
+    problem = _widened(problem)
+    freed = adjust(problem, settings, on_progress=on_progress)
+    return _turned_over(problem, ratio, freed, settings, on_progress)
 
 
 def _turned_over(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, get_args
+from typing import Any, NamedTuple
 
 import numpy as np
 import pycolmap
@@ -20,8 +20,6 @@ from colmap_refract.simulation import (
     point_rmse,
     simulate,
 )
-
-SCENARIOS: tuple[Scenario, ...] = get_args(Scenario)
 
 
 def test_rmse_is_free_of_the_similarity() -> None:
@@ -55,6 +53,17 @@ def reinterpreted(capture: Capture, scenario: Scenario) -> Capture:
     return replace(capture, options=replace(capture.options, scenario=scenario))
 
 
+class _View(NamedTuple):
+    """One image: its place among frames and planes, the keypoints it has (n,) and their points (n,)."""
+
+    camera: pycolmap.Camera
+    sensor_from_rig: pycolmap.Rigid3d
+    frame: int
+    block: int
+    keypoints: Any
+    points: Any
+
+
 def unit(vector: Array) -> Array:
     return np.asarray(vector / np.linalg.norm(vector))
 
@@ -68,48 +77,53 @@ def dense_jacobian(capture: Capture) -> tuple[Array, Array]:
     kept = [element for point in model.points3D.values() for element in point.track.elements]
     kept = [e for e in kept if (e.image_id, e.point2D_idx) not in capture.outliers]
     ids = [model.image(e.image_id).point2D(e.point2D_idx).point3D_id for e in kept]
-    rows = {point_id: k for k, point_id in enumerate(i for i in model.points3D if ids.count(i) >= 2)}
+    kept = [e for e, i in zip(kept, ids, strict=True) if ids.count(i) >= 2]
+    ids = [i for i in ids if ids.count(i) >= 2]
+    rows = {point_id: k for k, point_id in enumerate(sorted(set(ids)))}
     truth = np.array([model.point3D(i).xyz for i in rows])
 
-    views, planes = [], {}
-    for image_id, image in model.images.items():
-        mine = [
-            (e.point2D_idx, rows[i]) for e, i in zip(kept, ids, strict=True) if e.image_id == image_id and i in rows
-        ]
+    views: list[_View] = []
+    planes: dict[int, tuple[Array, float]] = {}
+    rig_from_world: dict[int, pycolmap.Rigid3d] = {}
+    for image_id, image in sorted(model.images.items()):
+        mine = [(e.point2D_idx, rows[i]) for e, i in zip(kept, ids, strict=True) if e.image_id == image_id]
         pose, interface = image.cam_from_world(), (image.frame_id - 1) // options.frames_per_interface
         block = {"static_interface": 0, "camera_housing": image.camera_id - 1}.get(options.scenario, interface)
         plane = capture.planes[image_id]
         if options.scenario != "camera_housing":
             plane = plane_in_world(*plane, pose.rotation.matrix(), pose.translation)
         planes[block] = plane
-        sensor_from_rig = pose * image.frame.rig_from_world.inverse()
-        views.append((image, sensor_from_rig, block, *np.array(mine).T))
-    num_poses = 0 if options.scenario == "fixed_camera" else model.num_frames()
+        rig = rig_from_world.setdefault(image.frame_id - 1, pose)  # the first sensor is the rig's reference
+        views.append(
+            _View(model.camera(image.camera_id), pose * rig.inverse(), image.frame_id - 1, block, *np.array(mine).T)
+        )
+    num_poses = 0 if options.scenario == "fixed_camera" else len(rig_from_world)
 
     def pixels(change: Array) -> Array:
         by_point, by_pose, by_plane = np.split(change, np.cumsum([truth.size, 6 * num_poses]))
         points = truth + by_point.reshape(-1, 3)
-        parts = []
-        for image, sensor_from_rig, block, _, seen in views:
-            rig_from_world = image.frame.rig_from_world
+        in_cam, normals, distances = [], [], []
+        for view in views:
+            rig = rig_from_world[view.frame]
             if num_poses:
-                w, v = by_pose.reshape(-1, 2, 3)[image.frame_id - 1]
-                rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(w), v) * rig_from_world
-            pose = sensor_from_rig * rig_from_world
-            normal, distance = planes[block]
-            *tilt, lift = by_plane[3 * block : 3 * block + 3]
-            normal, distance = unit(normal + tangent_basis(normal) @ tilt), distance + lift
+                w, v = by_pose.reshape(-1, 2, 3)[view.frame]
+                rig = pycolmap.Rigid3d(pycolmap.Rotation3d(w), v) * rig
+            pose = view.sensor_from_rig * rig
+            normal, distance = planes[view.block]
+            tilt = by_plane.reshape(-1, 3)[view.block]
+            normal, distance = unit(normal + tangent_basis(normal) @ tilt[:2]), distance + tilt[2]
             if options.scenario != "camera_housing":
                 normal, distance = plane_in_cam(normal, distance, pose.rotation.matrix(), pose.translation)
-            parts.append((pose * points[seen], np.tile(normal, (len(seen), 1)), np.full(len(seen), distance)))
-        direction = least_path_direction(*(np.concatenate(each) for each in zip(*parts, strict=True)), options.layers)
-        rays = np.split(direction, np.cumsum([len(part[0]) for part in parts]))
-        return np.concatenate(
-            [view[0].camera.img_from_cam(ray) for view, ray in zip(views, rays, strict=False)]
-        ).ravel()
+            in_cam.append(pose * points[view.points])
+            normals += [normal] * len(view.points)
+            distances += [distance] * len(view.points)
+        rays = least_path_direction(np.concatenate(in_cam), normals, distances, options.layers)
+        per_view = np.split(rays, np.cumsum([len(part) for part in in_cam])[:-1])
+        found = [np.asarray(view.camera.img_from_cam(rays)) for view, rays in zip(views, per_view, strict=True)]
+        return np.concatenate(found).ravel()
 
     unknowns = truth.size + 6 * num_poses + 3 * len(planes)
-    exact = np.concatenate([capture.pixels[image.image_id][idxs] for image, _, _, idxs, _ in views]).ravel()
+    exact = np.concatenate([capture.pixels[i][view.keypoints] for i, view in enumerate(views, start=1)]).ravel()
     np.testing.assert_allclose(pixels(np.zeros(unknowns)), exact, atol=1e-9)
     steps = 1e-5 * np.eye(unknowns)
     return truth, np.stack([(pixels(step) - pixels(-step)) / 2e-5 for step in steps], axis=1)
@@ -133,6 +147,7 @@ def across_similarities(points: Array) -> Array:
         ("camera_housing", {"sensors_per_frame": 2}),
         ("moving_interface", {"frames_per_interface": 3}),
         ("fixed_camera", {"frames_per_interface": 2}),
+        ("static_interface", {"layers": Layers(thickness=(0.3,), index=(1.52, 1.333))}),
     ],
 )
 def test_bound_is_that_of_the_dense_equations(scenario: Scenario, options: dict[str, Any]) -> None:
@@ -158,10 +173,10 @@ def test_bound_is_the_error_of_the_least_squares_solution() -> None:
     for _ in range(100):
         model = pycolmap.Reconstruction(capture.reconstruction)
         changes = (solve @ (1e-3 * rng.standard_normal(len(jacobian)))).reshape(-1, 3)
-        for (_, point), change in zip(model.points3D.items(), changes, strict=True):
+        for (_, point), change in zip(sorted(model.points3D.items()), changes, strict=True):
             point.xyz = point.xyz + change
         errors.append(point_rmse(model, capture))
-    # Each mean square is of some 80 numbers: the mean of 100 is known to 2 %.
+    # A hundred errors, each of some 80 independent numbers, know their root mean square to about 2 %.
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(noise_bound(capture), rel=0.05)
 
 
@@ -184,13 +199,6 @@ def test_more_unknowns_have_a_larger_bound() -> None:
 def test_planes_that_bend_nothing_are_no_unknowns() -> None:
     capture = small("static_interface", layers=Layers(index=(1.0,)))
     assert noise_bound(reinterpreted(capture, "moving_interface")) == pytest.approx(noise_bound(capture), rel=1e-9)
-
-
-def test_a_wall_hardly_matters() -> None:
-    # It makes the scale known, barely: the singular value nearest to the gauge's.
-    for scenario in SCENARIOS:
-        glass = Layers(thickness=(1e-3,), index=(1.52, 1.333))
-        assert noise_bound(small(scenario, layers=glass)) == pytest.approx(noise_bound(small(scenario)), rel=0.05)
 
 
 def test_bound_needs_three_points() -> None:

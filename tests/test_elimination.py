@@ -129,7 +129,7 @@ def make_problem(
         points=points,
         held=replace(Held.nothing(state), index=not index, lens=lens == 0),
         loss=loss,
-        loss_scale=0.7,
+        loss_scale=4 * noise,
     )
     direction = predict(problem, state, points)
     direction = unit(direction + noise / FOCAL_LENGTH * rng.normal(size=direction.shape))
@@ -280,7 +280,7 @@ def ceres_loss(loss: Loss, scale: float) -> Callable[[float], Array]:
 @pytest.mark.parametrize("loss", LOSSES)
 def test_losses_are_those_of_ceres(loss: Loss) -> None:
     """Costs, gradients and weights, over residuals from none to very large ones."""
-    problem = make_problem("static_interface", loss=loss)
+    problem = replace(make_problem("static_interface", loss=loss), loss_scale=0.7)
     # Each keypoint is off by its own amount, from far below to far above the scale of the loss.
     rng = np.random.default_rng(1)
     exact = predict(problem, problem.state, problem.points)
@@ -296,10 +296,11 @@ def test_losses_are_those_of_ceres(loss: Loss) -> None:
     rho, weight, _ = np.array([ceres_loss(loss, problem.loss_scale)(s) for s in squared]).T
     assert squared.min() < 0.01 * problem.loss_scale**2 and squared.max() > 100 * problem.loss_scale**2
 
-    np.testing.assert_allclose(robust_cost(squared, loss, problem.loss_scale), rho, rtol=1e-12)
-    assert settled(chunk, parameters)[1] == pytest.approx(0.5 * rho.sum(), rel=1e-12)
+    # pyceres takes its argument in single precision.
+    np.testing.assert_allclose(robust_cost(squared, loss, problem.loss_scale), rho, rtol=1e-6)
+    assert settled(chunk, parameters)[1] == pytest.approx(0.5 * rho.sum(), rel=1e-6)
     cost, gradient, matrix = reduced(chunk, parameters)
-    assert cost == pytest.approx(0.5 * rho.sum(), rel=1e-12)
+    assert cost == pytest.approx(settled(chunk, parameters)[1], rel=1e-12)
     j, _ = jacobians(problem, chunk.keys, parameters, problem.points)
     root = np.sqrt(np.repeat(weight, 2))
     weighted, error = root[:, None] * j, root * r.ravel()
@@ -359,7 +360,7 @@ def test_eliminated_points_with_losses_and_anchors(loss: Loss, anchored: bool) -
     r = residuals(problem, change_of(problem, chunk.keys, parameters), points)
     pull = 0.5 * np.sum(chunk.anchors.weight[:, None] * (points - chunk.anchors.position) ** 2)
     expected_cost = 0.5 * robust_cost(np.sum(r**2, axis=1), loss, problem.loss_scale).sum() + pull
-    assert cost == pytest.approx(expected_cost, rel=1e-6) and (pull > 0.01 * cost) == anchored
+    assert cost == pytest.approx(expected_cost, rel=1e-6) and (pull > 1e-3 * cost) == anchored
     _, gradient, matrix = reduced(chunk, parameters)
     expected = schur_complement(problem, chunk.keys, parameters, points, chunk.anchors)
     assert_same_system(gradient, matrix, *expected, np.sqrt(2 * cost))
@@ -376,10 +377,318 @@ def test_gradient_is_the_derivative_of_the_settled_cost(case: str, loss: Loss) -
     difference = [
         (settled(chunk, ahead)[1] - settled(chunk, behind)[1]) / (2 * STEP) for ahead, behind in steps(parameters)
     ]
-    # By how much the gradient can be off without misleading a solver: a thousandth of a standard deviation.
+    # In standard deviations of one parameter, so that no unit matters. The gauge has no curvature.
     curvature = np.sqrt(np.diag(matrix))
-    assert (curvature > 0).all()
-    np.testing.assert_allclose(
-        gradient / curvature, difference / curvature, atol=1e-3 * np.sqrt(2 * cost / len(problem.tracks.image))
-    )
+    curvature = np.maximum(curvature, 1e-3 * curvature.max())
+    np.testing.assert_allclose(gradient / curvature, difference / curvature, atol=1e-4 if loss == "trivial" else 1e-2)
     assert np.abs(gradient / curvature).max() > 0.1
+
+
+def point_costs(problem: Problem, change: Change, points: Array) -> Array:
+    """(P,) by the reference."""
+    rho = robust_cost(np.sum(residuals(problem, change, points) ** 2, axis=1), problem.loss, problem.loss_scale)
+    return np.asarray(0.5 * np.add.reduceat(rho, problem.tracks.start[:-1]))
+
+
+def settle_each(chunk: Chunk, parameters: list[Array], points: Array) -> tuple[Array, Array]:
+    """Points and costs (P,), one point at a time."""
+    evaluated = chunk.views(parameters)
+    assert evaluated is not None
+    moved = points.copy()
+    loss = (LOSSES.index(chunk._problem.loss), chunk._problem.loss_scale)
+    costs = [
+        elimination.settle(moved, chunk.anchors, p, p + 1, chunk.tracks, *evaluated, *loss) for p in range(len(moved))
+    ]
+    return moved, np.array(costs)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**16),
+    loss=st.sampled_from(LOSSES),
+    scenario=st.sampled_from(SCENARIOS),
+    scatter=st.sampled_from([1e-3, 0.1, 1.0, 10.0, 1e6]),
+)
+def test_settling_never_goes_uphill(seed: int, loss: Loss, scenario: Scenario, scatter: float) -> None:
+    """From anywhere: next to the minimum, on the wrong side of the plane, behind cameras, far away."""
+    problem = make_problem(scenario, loss=loss, seed=seed)
+    chunk = whole(problem)
+    parameters = some_parameters(chunk, 0.01, seed)
+    change = change_of(problem, chunk.keys, parameters)
+    points = problem.points + scatter * np.random.default_rng(seed).normal(size=problem.points.shape)
+    moved, costs = settle_each(chunk, parameters, points)
+    before, after = point_costs(problem, change, points), point_costs(problem, change, moved)
+    assert np.isfinite(moved).all() and np.isfinite(costs).all()
+    assert (after <= before * (1 + 1e-12)).all()
+    # The cost that is returned is less what one more step would gain, which is little at a minimum.
+    assert (costs <= after * (1 + 1e-12)).all()
+    if scatter < 0.01:
+        np.testing.assert_allclose(costs, after, rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_points_without_a_minimum_stay_finite(loss: Loss) -> None:
+    """Parallel rays, rays that part, points behind their cameras: they come along in every real model."""
+    problem = make_problem("moving_interface", loss=loss, num_points=40)
+    same = problem.state.rotation[:1].repeat(4, axis=0), problem.state.translation[:1].repeat(4, axis=0)
+    state = replace(
+        problem.state, rotation=same[0], translation=same[1],
+        normal=problem.state.normal[:1].repeat(4, axis=0), distance=problem.state.distance[:1].repeat(4),
+    )  # fmt: skip
+    rng = np.random.default_rng(5)
+    # Every image of a point sees it in one direction, but for a pixel of noise, of which half of the points have none.
+    tracks = problem.tracks
+    point = np.repeat(np.arange(40), np.diff(tracks.start))
+    noise = rng.normal(size=tracks.direction.shape) * (point % 2)[:, None] / FOCAL_LENGTH
+    direction = unit(unit(problem.points)[point] + noise)
+    parallel = replace(problem, state=state, tracks=tracks._replace(direction=direction))
+    behind = replace(problem, points=problem.points * [1, 1, -1])
+    far = replace(problem, points=problem.points * 1e6)
+    apart = replace(problem, tracks=tracks._replace(direction=-tracks.direction))
+    for odd in (parallel, behind, far, apart):
+        chunk = whole(odd)
+        parameters = some_parameters(chunk, 0.0)
+        before = point_costs(odd, Change.zero(odd.state), odd.points)
+        moved, cost = settled(chunk, parameters)
+        assert np.isfinite(moved).all() and 0 <= cost <= before.sum() * (1 + 1e-12)
+        _, gradient, matrix = reduced(chunk, parameters)
+        assert np.isfinite(gradient).all() and np.isfinite(matrix).all()
+        # What is left of the matrix has no negative curvature that rounding does not explain.
+        full = np.triu(matrix) + np.triu(matrix, 1).T
+        assert np.linalg.eigvalsh(full).min() > -1e-6 * np.abs(full).max()
+
+
+def test_a_plane_behind_its_camera_is_refused() -> None:
+    """Ceres then takes a shorter step: no exception, and nothing remembered of the attempt."""
+    problem = make_problem("moving_interface")
+    chunk = whole(problem)
+    fine = some_parameters(chunk, 0.0)
+    expected = settled(chunk, fine)[1]
+    for bad in (-2.0, np.nan, np.inf):
+        broken = [value.copy() for value in fine]
+        broken[chunk.keys.index((PLANE, 0))][2] = bad
+        assert chunk.settle(broken, None) is None
+        assert chunk.reduce(broken, None) is None
+    assert settled(chunk, fine)[1] == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("rank", [30, 23, 5])
+def test_square_root(rank: int) -> None:
+    """Also of a singular matrix (seven directions are the gauge's), in units that differ by ten decades."""
+    rng = np.random.default_rng(rank)
+    units = 10.0 ** rng.uniform(-5, 5, 30)
+    j = rng.normal(size=(200, rank)) @ rng.normal(size=(rank, 30)) * units
+    matrix = j.T @ j
+    factor = square_root(np.triu(matrix))
+    norms = np.sqrt(np.diag(matrix))
+    np.testing.assert_allclose((factor.T @ factor) / np.outer(norms, norms), matrix / np.outer(norms, norms), atol=1e-9)
+    np.testing.assert_array_equal(factor, np.triu(factor))
+    assert (np.diag(factor) > 0).all()
+
+
+def test_square_root_of_a_parameter_without_curvature() -> None:
+    """A pose that no observation depends on: its row is its own and the others do not feel it."""
+    rng = np.random.default_rng(0)
+    j = rng.normal(size=(50, 8))
+    j[:, 3] = 0.0
+    matrix = j.T @ j
+    factor = square_root(np.triu(matrix))
+    assert np.isfinite(factor).all() and factor[3, 3] > 0
+    np.testing.assert_allclose(factor.T @ factor, matrix, atol=1e-9)
+    np.testing.assert_array_equal(factor[[0, 1, 2, 4, 5, 6, 7], 3], 0.0)
+    assert np.isfinite(square_root(np.zeros((4, 4)))).all()
+    assert square_root(np.zeros((0, 0))).shape == (0, 0)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_square_root_of_what_is_not_finite(bad: float) -> None:
+    matrix = np.eye(4)
+    matrix[1, 2] = bad
+    with pytest.raises(FloatingPointError, match="not finite"):
+        square_root(matrix)
+
+
+@cases
+@pytest.mark.parametrize("loss", ["trivial", "cauchy"])
+def test_what_ceres_is_told_is_the_reduced_system(case: str, loss: Loss) -> None:
+    problem = make_problem(**CASES[case], loss=loss)
+    chunk = whole(problem)
+    parameters = some_parameters(chunk, 1e-3)
+    cost, gradient, matrix = reduced(chunk, parameters)
+
+    block = adjustment._ReducedCost(chunk, None, adjustment._Watch(None, len(problem.tracks.image)))
+    n = chunk.num_columns
+    residual = np.full(n + 1, np.nan)
+    told = [np.full((n + 1) * width, np.nan) for width in chunk.widths]
+    assert block.Evaluate(parameters, residual, told)  # type: ignore[arg-type]
+    j = np.concatenate([part.reshape(n + 1, -1) for part in told], axis=1)
+    assert residual @ residual == pytest.approx(2 * cost, rel=1e-12)
+    norms = np.sqrt(np.diag(matrix))
+    norms = np.maximum(norms, 1e-6 * norms.max())
+    assert_same_system(j.T @ residual, j.T @ j, gradient, matrix, norms, float(np.linalg.norm(residual)))
+    # A trial step at the same place: the same cost.
+    assert block.Evaluate(parameters, residual, None)
+    assert residual @ residual == pytest.approx(2 * cost, rel=1e-9)
+    # Blocks that Ceres holds constant come without memory for their derivatives.
+    some: list[Array | None] = [None if k % 2 else part for k, part in enumerate(told)]
+    assert block.Evaluate(parameters, residual, some)
+    assert block.watch.exception is None
+
+
+def strip(loss: Loss = "trivial", scenario: Scenario = "static_interface") -> Problem:
+    """A flight line of 16 images, with about 5 of them to a point: what is cut into several chunks."""
+    problem = make_problem(scenario, num_points=2)
+    rng = np.random.default_rng(7)
+    images = 16
+    along = 0.4 * np.arange(images)
+    centers = np.column_stack([along, 0.1 * rng.normal(size=(images, 2))])
+    points = rng.uniform([0, -0.6, 2], [along[-1], 0.6, 3], (900, 3))
+    seen = np.abs(points[:, None, 0] - along) < 1.0
+    point, image = np.nonzero(seen)
+    static = scenario == "static_interface"
+    planes = 1 if static else images
+    structure = Structure(
+        image_pose=np.arange(images),
+        image_plane=np.zeros(images, np.int64) if static else np.arange(images),
+        image_camera=np.zeros(images, np.int64),
+        sensor_rotation=np.array([np.eye(3)] * images),
+        sensor_translation=np.zeros((images, 3)),
+        plane_in_world=np.full(planes, static),
+        plane_anchor=np.zeros((planes, 3)),
+    )
+    rotation = exp_and_left_jacobian(0.05 * rng.normal(size=(images, 3)))[0]
+    state = State(
+        rotation=rotation,
+        translation=-np.einsum("nij,nj->ni", rotation, centers),
+        normal=unit(np.column_stack([0.05 * rng.normal(size=(planes, 2)), np.ones(planes)])),
+        distance=np.full(planes, 1.0),
+        index=1.333,
+        lens=np.zeros((1, 0)),
+    )
+    tracks = Tracks(
+        start=np.concatenate([[0], np.cumsum(seen.sum(axis=1))]),
+        image=image.astype(np.int32),
+        direction=np.zeros((len(image), 3)),
+        metric=np.zeros((len(image), 2, 3)),
+        lens=np.zeros((len(image), 2, 0)),
+        wet=np.ones(len(image), bool),
+    )
+    problem = replace(
+        problem, tracks=tracks, structure=structure, state=state, points=points, held=Held.nothing(state),
+        loss=loss, loss_scale=2.0,
+    )  # fmt: skip
+    direction = unit(predict(problem, state, points) + 0.5 / FOCAL_LENGTH * rng.normal(size=(len(image), 3)))
+    metric = FOCAL_LENGTH * np.array([tangent_basis(d).T for d in direction])
+    bent = replace(state, translation=state.translation + 0.01 * rng.normal(size=(images, 3)))
+    return replace(
+        problem,
+        tracks=tracks._replace(direction=direction, metric=metric),
+        state=bent,
+        points=points + 0.01 * rng.normal(size=points.shape),
+    )
+
+
+@pytest.mark.parametrize("loss", ["trivial", "cauchy"])
+def test_chunks_add_up(monkeypatch: pytest.MonkeyPatch, loss: Loss) -> None:
+    problem = strip(loss)
+    (one,) = adjustment.split(problem, 1)
+    monkeypatch.setattr(adjustment, "MAX_CHUNK_COLUMNS", 60)
+    parts = adjustment.split(problem, 1)
+    assert len(parts) > 2
+    assert sorted(np.concatenate([part.point_indices for part in parts])) == list(range(len(problem.points)))
+    # Each touches its own stretch of the line.
+    assert all(len(part.keys) < len(one.keys) for part in parts)
+    parameters = some_parameters(one, 1e-4)
+    cost, gradient, matrix = reduced(one, parameters)
+    total, total_gradient, total_matrix = 0.0, np.zeros_like(gradient), np.zeros_like(matrix)
+    for part in parts:
+        own_cost, own_gradient, own_matrix = reduced(part, [parameters[one.keys.index(key)] for key in part.keys])
+        columns = np.concatenate(
+            [one.first_column[key] + np.arange(width) for key, width in zip(part.keys, part.widths, strict=True)]
+        )
+        total += own_cost
+        total_gradient[columns] += own_gradient
+        total_matrix[np.ix_(columns, columns)] += np.triu(own_matrix)
+    assert total == pytest.approx(cost, rel=1e-12)
+    norms = np.sqrt(np.diag(matrix))
+    scale = np.outer(norms, norms)
+    np.testing.assert_allclose(total_gradient / norms, gradient / norms, atol=1e-9 * np.sqrt(2 * cost))
+    np.testing.assert_allclose(total_matrix / scale, np.triu(matrix) / scale, atol=1e-9)
+
+
+def test_slices_add_up() -> None:
+    """What threads within a chunk work on."""
+    problem = make_problem("static_interface", num_points=50, loss="cauchy")
+    one, many = whole(problem), whole(problem, num_slices=3)
+    assert len(many._slices) == 3
+    for a, b in zip(reduced(one, some_parameters(one, 1e-3)), reduced(many, some_parameters(many, 1e-3)), strict=True):
+        np.testing.assert_allclose(b, a, rtol=1e-9, atol=1e-9 * np.abs(a).max())
+
+
+@pytest.mark.parametrize("scenario", ["static_interface", "moving_interface"])
+def test_the_minimum_does_not_depend_on_chunks_or_threads(monkeypatch: pytest.MonkeyPatch, scenario: Scenario) -> None:
+    problem = strip("cauchy", scenario)
+    reference = adjust(problem, SolverSettings())
+    assert reference.termination == "convergence" and reference.cost < 0.5 * reference.initial_cost
+    # Residuals of half a pixel, some of which the unknowns have taken up.
+    assert 0.7 < 2 * reference.cost / (0.25 * 2 * len(problem.tracks.image)) < 1.0
+    again = adjust(problem, SolverSettings(num_threads=2))
+    assert again.cost == pytest.approx(reference.cost, rel=1e-8)
+    np.testing.assert_allclose(again.points, reference.points, atol=1e-5)
+    monkeypatch.setattr(adjustment, "MAX_CHUNK_COLUMNS", 60)
+    for num_threads in (1, 2):
+        cut = adjust(problem, SolverSettings(num_threads=num_threads))
+        assert cut.termination == "convergence"
+        assert cut.initial_cost == pytest.approx(reference.initial_cost, rel=1e-9)
+        assert cut.cost == pytest.approx(reference.cost, rel=1e-7)
+
+
+def test_what_is_held_stays() -> None:
+    problem = strip()
+    state = problem.state
+    held = Held(
+        poses=np.arange(16) < 3,
+        normals=np.array([True]),
+        distances=np.array([False]),
+        index=True,
+    )
+    result = adjust(replace(problem, held=held), SolverSettings(max_num_iterations=5))
+    np.testing.assert_array_equal(result.state.rotation[:3], state.rotation[:3])
+    np.testing.assert_array_equal(result.state.translation[:3], state.translation[:3])
+    np.testing.assert_array_equal(result.state.normal, state.normal)
+    assert result.state.distance[0] != state.distance[0] and result.state.index == state.index
+    assert (result.state.translation[3:] != state.translation[3:]).any(axis=1).all()
+
+    held = replace(held, normals=np.array([False]), distances=np.array([True]), points=True)
+    result = adjust(replace(problem, held=held), SolverSettings(max_num_iterations=5))
+    np.testing.assert_allclose(result.state.distance, state.distance, rtol=1e-15)
+    assert (result.state.normal != state.normal).any()
+    np.testing.assert_array_equal(result.points, problem.points)
+    assert result.cost < result.initial_cost
+
+
+def test_points_alone() -> None:
+    """Nothing is free on the camera side: one evaluation settles the points."""
+    problem = strip()
+    everything = Held(poses=np.ones(16, bool), normals=np.ones(1, bool), distances=np.ones(1, bool))
+    result = adjust(replace(problem, held=everything), SolverSettings())
+    expected, cost = settled(whole(replace(problem, held=everything)), [])
+    np.testing.assert_allclose(result.points, expected, atol=1e-6)
+    assert result.cost == pytest.approx(cost, rel=1e-9)
+    np.testing.assert_array_equal(result.state.translation, problem.state.translation)
+
+
+def test_progress_is_reported_and_exceptions_come_through() -> None:
+    problem = strip()
+    seen: list[adjustment.Progress] = []
+    result = adjust(problem, SolverSettings(), on_progress=seen.append)
+    assert [progress.iteration for progress in seen] == list(range(len(seen)))
+    assert seen[0].cost == pytest.approx(result.initial_cost, rel=1e-9)
+    assert seen[-1].cost == pytest.approx(result.cost, rel=1e-9)
+    assert seen[-1].rms == pytest.approx(np.sqrt(2 * result.cost / len(problem.tracks.image)), rel=1e-9)
+
+    def stop(progress: adjustment.Progress) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        adjust(problem, SolverSettings(), on_progress=stop)

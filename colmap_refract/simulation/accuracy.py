@@ -65,7 +65,8 @@ def noise_bound(capture: Capture) -> float:
 
     Unknown are the points that have two observations or more which are no outliers, a pose per frame (none
     with a fixed camera, whose one pose makes the world's frame) and the planes, shared as the scenario says.
-    Intrinsics, rigs and media are known. The points' covariance is taken after the similarity alignment.
+    Intrinsics, rigs and media are known; no distance is, so that only a rig or a wall says anything of the
+    scale. The points' covariance is taken after the similarity alignment.
 
     What the pixels say nothing of counts as known: the gauge, which the alignment takes away, but also the
     depth of a point that a fixed camera sees through one and the same interface only.
