@@ -116,19 +116,19 @@ def _try(
 def _settle_and_free(
     problem: Problem, ratio: float, settings: SolverSettings, on_progress: Callable[[Progress], None] | None
 ) -> Start | None:
-    """Solve behind planes that stand still, then with everything free."""
-    held = replace(
-        problem.held,
-        normals=np.ones_like(problem.held.normals),
-        distances=np.ones_like(problem.held.distances),
-        index=True,
-        lens=True,
-    )
+    """Solve behind planes that stand still, then let them tilt, then with everything free."""
     quick = replace(settings, max_num_iterations=min(25, settings.max_num_iterations), function_tolerance=1e-3)
-    problem = _widened(retriangulate(_widened(problem), settings))
-    settled = adjust(replace(problem, held=held), quick, on_progress=on_progress)
-    if settled.termination != "failure":
-        problem = _widened(replace(problem, state=settled.state, points=settled.points))
+    all_planes = np.ones_like(problem.held.normals)
+    standing = replace(problem.held, normals=all_planes, distances=all_planes, index=True, lens=True)
+    tilting = replace(problem.held, distances=all_planes, index=True, lens=True)
+    problem = retriangulate(_widened(problem), settings)
+    # A plane with a wrong normal would rather run into the camera than tilt: the distance is freed last.
+    for held in (standing, tilting):
+        problem = _widened(problem)
+        settled = adjust(replace(problem, held=held), quick, on_progress=on_progress)
+        if settled.termination != "failure":
+            problem = replace(problem, state=settled.state, points=settled.points)
+    problem = _widened(problem)
     freed = adjust(problem, settings, on_progress=on_progress)
     return _turned_over(problem, ratio, freed, settings, on_progress)
 

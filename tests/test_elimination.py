@@ -419,9 +419,10 @@ def test_settling_never_goes_uphill(seed: int, loss: Loss, scenario: Scenario, s
     moved, costs = settle_each(chunk, parameters, points)
     before, after = point_costs(problem, change, points), point_costs(problem, change, moved)
     assert np.isfinite(moved).all() and np.isfinite(costs).all()
-    assert (after <= before * (1 + 1e-12)).all()
+    rounding = 1e-9 * before + 1e-12
+    assert (after <= before + rounding).all()
     # The cost that is returned is less what one more step would gain, which is little at a minimum.
-    assert (costs <= after * (1 + 1e-12)).all()
+    assert (costs <= after + rounding).all()
     if scatter < 0.01:
         np.testing.assert_allclose(costs, after, rtol=1e-5, atol=1e-9)
 
@@ -526,9 +527,9 @@ def test_what_ceres_is_told_is_the_reduced_system(case: str, loss: Loss) -> None
     norms = np.sqrt(np.diag(matrix))
     norms = np.maximum(norms, 1e-6 * norms.max())
     assert_same_system(j.T @ residual, j.T @ j, gradient, matrix, norms, float(np.linalg.norm(residual)))
-    # A trial step at the same place: the same cost.
+    # A trial step at the same place: the same cost, to what a settled point has left.
     assert block.Evaluate(parameters, residual, None)
-    assert residual @ residual == pytest.approx(2 * cost, rel=1e-9)
+    assert residual @ residual == pytest.approx(2 * cost, rel=1e-6)
     # Blocks that Ceres holds constant come without memory for their derivatives.
     some: list[Array | None] = [None if k % 2 else part for k, part in enumerate(told)]
     assert block.Evaluate(parameters, residual, some)
@@ -630,8 +631,8 @@ def test_the_minimum_does_not_depend_on_chunks_or_threads(monkeypatch: pytest.Mo
     problem = strip("cauchy", scenario)
     reference = adjust(problem, SolverSettings())
     assert reference.termination == "convergence" and reference.cost < 0.5 * reference.initial_cost
-    # Residuals of half a pixel, some of which the unknowns have taken up.
-    assert 0.7 < 2 * reference.cost / (0.25 * 2 * len(problem.tracks.image)) < 1.0
+    # Two residuals of half a pixel each; the 3 unknowns of a point take up a third of them, and the loss a little.
+    assert 0.55 < 2 * reference.cost / (0.25 * 2 * len(problem.tracks.image)) < 0.68
     again = adjust(problem, SolverSettings(num_threads=2))
     assert again.cost == pytest.approx(reference.cost, rel=1e-8)
     np.testing.assert_allclose(again.points, reference.points, atol=1e-5)
@@ -655,7 +656,7 @@ def test_what_is_held_stays() -> None:
     result = adjust(replace(problem, held=held), SolverSettings(max_num_iterations=5))
     np.testing.assert_array_equal(result.state.rotation[:3], state.rotation[:3])
     np.testing.assert_array_equal(result.state.translation[:3], state.translation[:3])
-    np.testing.assert_array_equal(result.state.normal, state.normal)
+    np.testing.assert_allclose(result.state.normal, state.normal, atol=1e-15)
     assert result.state.distance[0] != state.distance[0] and result.state.index == state.index
     assert (result.state.translation[3:] != state.translation[3:]).any(axis=1).all()
 
