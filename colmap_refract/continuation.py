@@ -121,7 +121,7 @@ def _settle_and_free(
     all_planes = np.ones_like(problem.held.normals)
     standing = replace(problem.held, normals=all_planes, distances=all_planes, index=True, lens=True)
     tilting = replace(problem.held, distances=all_planes, index=True, lens=True)
-    problem = retriangulate(_widened(problem), settings)
+    problem = retriangulate(_widened(problem))
     # A plane with a wrong normal would rather run into the camera than tilt: the distance is freed last.
     for held in (standing, tilting):
         problem = _widened(problem)
@@ -222,7 +222,7 @@ def _turned_over(
         mirrored = _mirrored(best.problem)
         if mirrored is None:
             return best
-        mirrored = _widened(retriangulate(mirrored, settings))
+        mirrored = _widened(retriangulate(mirrored))
         turned = _start(mirrored, ratio, adjust(mirrored, settings, on_progress=on_progress))
         if turned is None or _wide_cost(turned.problem) >= _wide_cost(best.problem):
             return best
@@ -271,8 +271,8 @@ def _stands(problem: Problem) -> bool:
     return bool((distance[np.isfinite(distance)] > 0.0).all())
 
 
-def retriangulate(problem: Problem, settings: SolverSettings) -> Problem:
-    """The problem with each point at the better of two minima: from where it is, and from where its rays meet.
+def retriangulate(problem: Problem) -> Problem:
+    """The problem with each point where it is, or where its refracted rays meet if that costs less.
 
     A robust cost has several minima; wrong matches, and positions from another geometry, lead to the wrong one.
     """
@@ -280,14 +280,15 @@ def retriangulate(problem: Problem, settings: SolverSettings) -> Problem:
         return problem
     layers = problem.layers.with_index(problem.state.index)
     meeting = triangulate(problem.tracks, problem.structure, problem.state, layers, problem.points)
-    points, costs = [], []
-    for start in (problem.points, meeting):
-        candidate = replace(problem, points=start)
-        candidate = replace(candidate, points=settle_points(candidate, settings))
-        squared = (residuals(candidate) ** 2).sum(axis=1)
-        costs.append(np.add.reduceat(robust_cost(squared, problem.loss, problem.loss_scale), problem.tracks.start[:-1]))
-        points.append(candidate.points)
-    return replace(problem, points=np.where((costs[0] <= costs[1])[:, None], points[0], points[1]))
+    here, there = (_point_costs(replace(problem, points=points)) for points in (problem.points, meeting))
+    return replace(problem, points=np.where((here <= there)[:, None], problem.points, meeting))
+
+
+def _point_costs(problem: Problem) -> Array:
+    """Robust cost (P,) of each point where it is."""
+    squared = (residuals(problem) ** 2).sum(axis=1)
+    each = robust_cost(squared, problem.loss, problem.loss_scale)
+    return np.asarray(np.add.reduceat(each, problem.tracks.start[:-1]))
 
 
 def _widened(problem: Problem, loss: Loss = "cauchy") -> Problem:
@@ -331,7 +332,7 @@ def _unbend(
     )
     held = replace(problem.held, normals=np.zeros(count, bool), distances=np.zeros(count, bool), index=True, lens=True)
     own_planes = replace(problem, structure=own, state=state, held=held)
-    loose = _widened(retriangulate(_widened(own_planes), settings))
+    loose = _widened(retriangulate(_widened(own_planes)))
     quick = replace(settings, max_num_iterations=25, function_tolerance=1e-4)
     adjusted = adjust(loose, quick, on_progress=on_progress)
     if adjusted.termination == "failure":
@@ -392,8 +393,8 @@ def spread_out(arrangement: Arrangement, start: Start, settings: SolverSettings)
     """All observations, from a start that was found on a few; the other points go where their rays meet."""
     problem = arrangement.start(start.ratio, arrangement.observations)
     problem = replace(problem, state=start.problem.state, layers=start.problem.layers)
-    problem = replace(problem, loss="cauchy", loss_scale=_WIDE_LOSS)
-    return retriangulate(problem, settings)
+    problem = retriangulate(replace(problem, loss="cauchy", loss_scale=_WIDE_LOSS))
+    return replace(problem, points=settle_points(problem, settings))
 
 
 def estimate_noise(problem: Problem) -> float:

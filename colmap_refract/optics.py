@@ -36,6 +36,8 @@ from colmap_refract.interface import Array, Layers
 # Contraction and reassociation only: NaN and infinity keep their meaning.
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 _MAX_NEWTON_STEPS = 40
+_NEWTON_TOLERANCE = 1e-7
+"""Newton converges quadratically: after a step as small as this the error is of rounding size."""
 
 
 class Media:
@@ -84,6 +86,27 @@ def snell_root(z, s, distance, ratio, walls):
     if not paraxial > 0.0:
         return np.nan, h
     g = 1.0 / paraxial
+    if last == 1:
+        # One interface, the usual case: the same iteration without the loop over layers.
+        first, r = distance * ratio[0], h * ratio[1]
+        c_first, c = s * (1.0 - ratio[0]) * (1.0 + ratio[0]), s * (1.0 - ratio[1]) * (1.0 + ratio[1])
+        for _ in range(_MAX_NEWTON_STEPS):
+            g2 = g * g
+            q = 1.0 / (1.0 + c * g2)
+            behind = r * math.sqrt(q)
+            before, by_before = first, first
+            if c_first > 0.0:
+                q_first = 1.0 / (1.0 + c_first * g2)
+                before = first * math.sqrt(q_first)
+                by_before = before * q_first
+            slope = by_before + behind * q
+            step = ((before + behind) * g - 1.0) / slope
+            if not slope > 0.0:
+                return np.nan, h
+            g -= step
+            if abs(step) <= _NEWTON_TOLERANCE * g:
+                break
+        return g, h
     for _ in range(_MAX_NEWTON_STEPS):
         sg2 = s * g * g
         value = -1.0
@@ -99,8 +122,7 @@ def snell_root(z, s, distance, ratio, walls):
         if not slope > 0.0:
             return np.nan, h
         g -= step
-        # Newton converges quadratically: after a step below 1e-9 the error is of rounding size.
-        if abs(step) <= 1e-9 * abs(g):
+        if abs(step) <= _NEWTON_TOLERANCE * g:
             break
     return g, h
 

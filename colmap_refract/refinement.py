@@ -17,7 +17,7 @@ from colmap_refract.alignment import Similarity, align_poses, rescale_about
 from colmap_refract.arrangement import Arrangement, arrange
 from colmap_refract.continuation import Watch, named, estimate_noise, find_start, is_sound, retriangulate, spread_out
 from colmap_refract.errors import RefractError
-from colmap_refract.filtering import filter_observations, label_wet, pinhole_errors, reprojection_errors
+from colmap_refract.filtering import Filtered, filter_observations, label_wet, pinhole_errors, reprojection_errors
 from colmap_refract.interface import Array, plane_in_cam
 from colmap_refract.model_io import copy_model
 from colmap_refract.observations import lift, read_observations
@@ -35,6 +35,8 @@ LOSS_SCALE_IN_NOISE = 4.0
 """Of the default loss: wide enough to lose nothing on Gaussian noise, narrow enough to stop a wrong match."""
 _LEAST_LOSS_SCALE = 1.0
 _NUM_FILTER_ROUNDS = 3
+_FIRST_FILTER = 2.0
+"""Times the user's limit, before the first solve of all tracks."""
 _NEGLIGIBLE_CHANGE = 1e-3
 """Part of the observations whose removal or relabelling is not worth another solve."""
 
@@ -185,23 +187,23 @@ def _solve(
     """Start, solve, filter and solve again, until nothing more is removed."""
     options = arrangement.options
     start = find_start(arrangement, settings, watch)
-    problem = _with_loss(arrangement, spread_out(arrangement, start, settings), estimate_noise(start.problem))
-    coarse = replace(settings, function_tolerance=max(1e-5, settings.function_tolerance))
-    adjustment = adjust(problem, coarse, on_progress=named(watch, "Refractive bundle adjustment"))
-    problem = replace(problem, state=adjustment.state, points=adjustment.points)
-    if not is_sound(problem):
-        _raise_unsound(problem)
+    if not start.sound:
+        _raise_unsound(start.problem)
+    problem = spread_out(arrangement, start, settings)
+    # The start comes from a few tracks: what it finds wrong by little may be right.
+    limit = _FIRST_FILTER * options.filter_max_reproj_error
     for round_ in range(_NUM_FILTER_ROUNDS + 1):
-        arrangement, problem = _filter(arrangement, problem, settings, counts)
-        stage = "Refractive bundle adjustment" + (f", filtered {round_ + 1}x" if round_ else "")
-        problem = _with_loss(arrangement, problem, estimate_noise(problem))
+        arrangement, problem = _filter(arrangement, problem, settings, counts, limit)
+        limit = options.filter_max_reproj_error
+        stage = "Refractive bundle adjustment" + (f", filtered {round_ + 1} times" if round_ else "")
+        problem = _with_loss(arrangement, problem, estimate_noise(problem if round_ else start.problem))
         adjustment = adjust(problem, settings, on_progress=named(watch, stage))
         problem = replace(problem, state=adjustment.state, points=adjustment.points)
         arrangement, problem, moved = _relift(arrangement, problem)
-        if not (moved or _would_change(arrangement, problem)):
+        if not (moved or _would_change(arrangement, problem, limit)):
             break
     # The last few outliers say too little to solve everything again for: their points alone are settled anew.
-    arrangement, problem = _filter(arrangement, problem, settings, counts)
+    arrangement, problem = _filter(arrangement, problem, settings, counts, limit)
     problem = replace(problem, points=settle_points(problem, settings))
     if not is_sound(problem):
         _raise_unsound(problem)
@@ -216,30 +218,30 @@ def _with_loss(arrangement: Arrangement, problem: Problem, noise: float) -> Prob
     return replace(problem, loss=adjustment.loss_function_type, loss_scale=scale)
 
 
-def _marks(arrangement: Arrangement, problem: Problem) -> Any:
+def _marks(arrangement: Arrangement, problem: Problem, limit: float) -> Filtered:
     options = arrangement.options
     return filter_observations(
         problem,
         arrangement.observations,
-        max_reproj_error=options.filter_max_reproj_error,
+        max_reproj_error=limit,
         min_tri_angle=options.min_tri_angle,
     )
 
 
-def _would_change(arrangement: Arrangement, problem: Problem) -> bool:
+def _would_change(arrangement: Arrangement, problem: Problem, limit: float) -> bool:
     relabelled = (label_wet(problem) != problem.tracks.wet).mean()
-    removed = 1.0 - _marks(arrangement, problem).keep.mean()
+    removed = 1.0 - _marks(arrangement, problem, limit).keep.mean()
     return bool(max(relabelled, removed) > _NEGLIGIBLE_CHANGE)
 
 
 def _filter(
-    arrangement: Arrangement, problem: Problem, settings: SolverSettings, counts: _Counts
+    arrangement: Arrangement, problem: Problem, settings: SolverSettings, counts: _Counts, limit: float
 ) -> tuple[Arrangement, Problem]:
     """Label wet and dry anew, remove outliers, and count them."""
     wet = label_wet(problem)
     if (wet != problem.tracks.wet).any():
-        problem = retriangulate(replace(problem, tracks=problem.tracks._replace(wet=wet)), settings)
-    marks = _marks(arrangement, problem)
+        problem = retriangulate(replace(problem, tracks=problem.tracks._replace(wet=wet)))
+    marks = _marks(arrangement, problem, limit)
     if marks.keep.all():
         return arrangement, problem
     observations = arrangement.observations.select(marks.keep)

@@ -15,6 +15,9 @@ from colmap_refract.scenario import State, Structure
 
 _ROUNDS = 6
 _MIN_DETERMINANT = 1e-9
+_LEAST_SCALE = 1e-3
+_COST_SCALE = 4.0
+"""Pixels: the scale of the Cauchy cost that judges the outcomes."""
 
 
 def refracted_rays(tracks: Tracks, structure: Structure, state: State, layers: Layers) -> tuple[Array, Array]:
@@ -52,67 +55,93 @@ def triangulate(tracks: Tracks, structure: Structure, state: State, layers: Laye
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _ray_errors(point, first, n, origin, ray, focal, error, reach):
+    """Distances of a point from n rays in pixels (over the range, times the focal length), and the ranges."""
+    for k in range(n):
+        r0, r1, r2 = ray[first + k]
+        d0, d1, d2 = point[0] - origin[first + k, 0], point[1] - origin[first + k, 1], point[2] - origin[first + k, 2]
+        along = r0 * d0 + r1 * d1 + r2 * d2
+        reach[k] = max(along, 1e-3)
+        error[k] = focal[first + k] * math.sqrt(max(d0 * d0 + d1 * d1 + d2 * d2 - along * along, 0.0)) / reach[k]
+        if not math.isfinite(error[k]):
+            error[k] = np.inf
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _weigh(n, error, reach, weight):
+    """Cauchy weights at the track's own median error; a nearer camera counts for more. The summed robust cost."""
+    scale = max(np.median(error[:n]), _LEAST_SCALE)
+    cost = 0.0
+    for k in range(n):
+        weight[k] = 0.0
+        cost += math.log1p(min(error[k], 1e9) ** 2 / _COST_SCALE**2)
+        if math.isfinite(error[k]):
+            weight[k] = 1.0 / ((1.0 + (error[k] / scale) ** 2) * reach[k] * reach[k])
+    return cost
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _nearest(first, n, origin, ray, weight, point):
+    """The point with the least weighted sum of squared distances from n rays; False where they are parallel."""
+    a00, a01, a02, a11, a12, a22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    b0, b1, b2 = 0.0, 0.0, 0.0
+    for k in range(n):
+        w = weight[k]
+        if w == 0.0:
+            continue
+        r0, r1, r2 = ray[first + k]
+        o0, o1, o2 = origin[first + k]
+        along = r0 * o0 + r1 * o1 + r2 * o2
+        a00 += w * (1.0 - r0 * r0)
+        a01 -= w * r0 * r1
+        a02 -= w * r0 * r2
+        a11 += w * (1.0 - r1 * r1)
+        a12 -= w * r1 * r2
+        a22 += w * (1.0 - r2 * r2)
+        b0 += w * (o0 - along * r0)
+        b1 += w * (o1 - along * r1)
+        b2 += w * (o2 - along * r2)
+    c00, c01, c02 = a11 * a22 - a12 * a12, a02 * a12 - a01 * a22, a01 * a12 - a02 * a11
+    determinant = a00 * c00 + a01 * c01 + a02 * c02
+    trace = a00 + a11 + a22
+    if not determinant > _MIN_DETERMINANT * trace * trace * trace:
+        return False
+    c11, c12, c22 = a00 * a22 - a02 * a02, a01 * a02 - a00 * a12, a00 * a11 - a01 * a01
+    point[0] = (c00 * b0 + c01 * b1 + c02 * b2) / determinant
+    point[1] = (c01 * b0 + c11 * b1 + c12 * b2) / determinant
+    point[2] = (c02 * b0 + c12 * b1 + c22 * b2) / determinant
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _nearest_to_rays(start, origin, ray, focal, points):
     longest = 1
     for p in range(points.shape[0]):
         longest = max(longest, start[p + 1] - start[p])
-    weight = np.empty(longest)
-    error = np.empty(longest)
+    weight, error, reach = np.empty(longest), np.empty(longest), np.empty(longest)
+    point, best = np.empty(3), np.empty(3)
     for p in range(points.shape[0]):
-        first, stop = start[p], start[p + 1]
-        n = stop - first
-        for k in range(n):
-            weight[k] = 1.0 if math.isfinite(origin[first + k, 0]) and math.isfinite(ray[first + k, 0]) else 0.0
-        for _ in range(_ROUNDS):
-            a00, a01, a02, a11, a12, a22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            b0, b1, b2 = 0.0, 0.0, 0.0
-            for k in range(n):
-                w = weight[k]
-                if w == 0.0:
-                    continue
-                r0, r1, r2 = ray[first + k]
-                o0, o1, o2 = origin[first + k]
-                along = r0 * o0 + r1 * o1 + r2 * o2
-                a00 += w * (1.0 - r0 * r0)
-                a01 -= w * r0 * r1
-                a02 -= w * r0 * r2
-                a11 += w * (1.0 - r1 * r1)
-                a12 -= w * r1 * r2
-                a22 += w * (1.0 - r2 * r2)
-                b0 += w * (o0 - along * r0)
-                b1 += w * (o1 - along * r1)
-                b2 += w * (o2 - along * r2)
-            c00, c01, c02 = a11 * a22 - a12 * a12, a02 * a12 - a01 * a22, a01 * a12 - a02 * a11
-            determinant = a00 * c00 + a01 * c01 + a02 * c02
-            trace = a00 + a11 + a22
-            if not determinant > _MIN_DETERMINANT * trace * trace * trace:
-                break
-            c11, c12, c22 = a00 * a22 - a02 * a02, a01 * a02 - a00 * a12, a00 * a11 - a01 * a01
-            x = (c00 * b0 + c01 * b1 + c02 * b2) / determinant
-            y = (c01 * b0 + c11 * b1 + c12 * b2) / determinant
-            z = (c02 * b0 + c12 * b1 + c22 * b2) / determinant
-            points[p, 0], points[p, 1], points[p, 2] = x, y, z
-            # Distances from the rays in pixels: over the range, times the focal length.
-            for k in range(n):
-                if weight[k] == 0.0:
-                    error[k] = np.inf
-                    continue
-                r0, r1, r2 = ray[first + k]
-                d0, d1, d2 = x - origin[first + k, 0], y - origin[first + k, 1], z - origin[first + k, 2]
-                along = r0 * d0 + r1 * d1 + r2 * d2
-                squared = max(d0 * d0 + d1 * d1 + d2 * d2 - along * along, 0.0)
-                reach = max(along, 1e-6)
-                error[k] = focal[first + k] * math.sqrt(squared) / reach
-            # Cauchy weights at the track's own median error; a nearer camera counts for more.
-            scale = max(np.median(error[:n]), 1e-3)
-            for k in range(n):
-                if weight[k] == 0.0:
-                    continue
-                r0, r1, r2 = ray[first + k]
-                d0, d1, d2 = x - origin[first + k, 0], y - origin[first + k, 1], z - origin[first + k, 2]
-                reach = max(r0 * d0 + r1 * d1 + r2 * d2, 1e-3)
-                ratio = error[k] / scale
-                weight[k] = 1.0 / ((1.0 + ratio * ratio) * reach * reach)
+        first = start[p]
+        n = start[p + 1] - first
+        best[:] = points[p]
+        least = np.inf
+        # From all rays alike, and from those that agree with the point as it is: the one survives a wrong
+        # point, the other wrong rays.
+        for known in range(2):
+            _ray_errors(points[p], first, n, origin, ray, focal, error, reach)
+            _weigh(n, error, reach, weight)
+            if known == 0:
+                for k in range(n):
+                    weight[k] = 1.0 if math.isfinite(error[k]) else 0.0
+            for _ in range(_ROUNDS):
+                if not _nearest(first, n, origin, ray, weight, point):
+                    break
+                _ray_errors(point, first, n, origin, ray, focal, error, reach)
+                cost = _weigh(n, error, reach, weight)
+                if cost < least:
+                    least = cost
+                    best[:] = point
+        points[p] = best
 
 
 def triangulation_angles(tracks: Tracks, structure: Structure, state: State, layers: Layers, points: Array) -> Array:

@@ -20,12 +20,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from colmap_refract import adjustment, elimination
-from colmap_refract.adjustment import Chunk, Held, Loss, Problem, SolverSettings, adjust, robust_cost, square_root
+from colmap_refract.adjustment import Chunk, Held, Problem, SolverSettings, adjust, robust_cost, square_root
 from colmap_refract.elimination import LENS, MEDIUM, PLANE, POSE, Anchors, Tracks
 from colmap_refract.interface import Array, Layers, tangent_basis
 from colmap_refract.optics import project_direction
+from colmap_refract.options import Loss, Scenario
 from colmap_refract.rotation import exp_and_left_jacobian
-from colmap_refract.scenario import SCENARIOS, Change, Scenario, State, Structure, apply, share_planes
+from colmap_refract.scenario import SCENARIOS, Change, State, Structure, apply, share_planes
 
 FOCAL_LENGTH = 1200.0
 WATER = Layers()
@@ -521,7 +522,7 @@ def test_what_ceres_is_told_is_the_reduced_system(case: str, loss: Loss) -> None
     n = chunk.num_columns
     residual = np.full(n + 1, np.nan)
     told = [np.full((n + 1) * width, np.nan) for width in chunk.widths]
-    assert block.Evaluate(parameters, residual, told)  # type: ignore[arg-type]
+    assert block.Evaluate(parameters, residual, told)
     j = np.concatenate([part.reshape(n + 1, -1) for part in told], axis=1)
     assert residual @ residual == pytest.approx(2 * cost, rel=1e-12)
     norms = np.sqrt(np.diag(matrix))

@@ -12,16 +12,15 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from colmap_refract.interface import Array, plane_in_cam, tangent_basis
+from colmap_refract.options import Scenario
 from colmap_refract.rotation import cross_matrix, exp_and_left_jacobian, mean_rotation
 from colmap_refract.scenario import (
     SCENARIOS,
     Change,
-    Scenario,
     State,
     Structure,
     apply,
     evaluate_views,
-    group_by_name,
     share_planes,
 )
 
@@ -239,8 +238,7 @@ def test_who_shares_a_plane(scenario: Scenario, planes: list[int], in_world: lis
 def test_groups_share_a_plane(
     scenario: Scenario, planes: list[int], in_world: list[bool], names: list[str | None]
 ) -> None:
-    group = group_by_name(["a", "b", "c", "d", "e", "f"], {"c": "tank", "d": "tank", "e": "tank", "f": "tank"})
-    assert group == [None, None, "tank", "tank", "tank", "tank"]
+    group = [None, None, "tank", "tank", "tank", "tank"]
     found = share_planes(scenario, FRAME, CAMERA, group, [False] * 6)
     assert (found[0].tolist(), found[1].tolist(), found[2]) == (planes, in_world, names)
 
