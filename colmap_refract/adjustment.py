@@ -354,6 +354,8 @@ def square_root(matrix: Array) -> Array:
     The matrix is scaled by its diagonal first, and a jitter relative to that makes the gauge's null
     space harmless. A parameter without any curvature gets a row of its own.
     """
+    if not np.isfinite(matrix).all():
+        raise FloatingPointError("the reduced system is not finite")
     diagonal = np.diag(matrix).copy()
     top = diagonal.max(initial=0.0)
     diagonal[diagonal <= 1e-300 + 1e-30 * top] = 1.0

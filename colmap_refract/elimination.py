@@ -20,7 +20,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from colmap_refract.interface import Array
-from colmap_refract.optics import FAST, slope_derivatives, snell_root
+from colmap_refract.optics import FAST, one_interface, slope_derivatives, snell_root
 
 POSE, PLANE, MEDIUM, LENS = range(4)
 """The slots of an image."""
@@ -28,8 +28,9 @@ POSE, PLANE, MEDIUM, LENS = range(4)
 TRIVIAL, HUBER, SOFT_L1, CAUCHY = range(4)
 """The robust losses."""
 
-MAX_POINT_STEPS = 10
-"""Half-solved points make the cost no function of the cameras; most points need one or two steps."""
+MAX_POINT_STEPS = 40
+"""Half-solved points make the cost no function of the cameras. Most need one or two steps, a residual near the
+scale of a robust loss many."""
 
 POINT_TOLERANCE = 1e-7
 """A point is at its minimum when one more step would lower its cost by less than this fraction.
@@ -133,11 +134,11 @@ def _observe(k, point, tracks, views, optics, with_interface, out):
     The derivatives by the interface are left out unless `with_interface`.
     """
     i = tracks.image[k]
-    rotation = views.rotation[i]
     x, y, w = point[0], point[1], point[2]
-    cx = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * w + views.translation[i, 0]
-    cy = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * w + views.translation[i, 1]
-    cz = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * w + views.translation[i, 2]
+    rotation = views.rotation
+    cx = rotation[i, 0, 0] * x + rotation[i, 0, 1] * y + rotation[i, 0, 2] * w + views.translation[i, 0]
+    cy = rotation[i, 1, 0] * x + rotation[i, 1, 1] * y + rotation[i, 1, 2] * w + views.translation[i, 1]
+    cz = rotation[i, 2, 0] * x + rotation[i, 2, 1] * y + rotation[i, 2, 2] * w + views.translation[i, 2]
     vx, vy, vz = cx, cy, cz
     nx, ny, nz = views.normal[i, 0], views.normal[i, 1], views.normal[i, 2]
     px, py, pz = 0.0, 0.0, 0.0
@@ -148,12 +149,15 @@ def _observe(k, point, tracks, views, optics, with_interface, out):
         px, py, pz = cx - z * nx, cy - z * ny, cz - z * nz
         s = px * px + py * py + pz * pz
         d = views.distance[i]
-        g, h = snell_root(z, s, d, optics.ratio, optics.walls)
-        if math.isfinite(g):
-            refracted = True
+        if optics.ratio.shape[0] == 2 and optics.ratio[1] < 1.0:
+            big, big_s, big_z, big_d, big_index = one_interface(z, s, d, optics.ratio[1], optics.ratio_by_index[1])
+        else:
+            g, h = snell_root(z, s, d, optics.ratio, optics.walls)
             big, big_s, big_z, big_d, big_index = slope_derivatives(
                 g, h, s, d, optics.ratio, optics.ratio_by_index, optics.walls
             )
+        if math.isfinite(big):
+            refracted = True
             vx, vy, vz = nx + big * px, ny + big * py, nz + big * pz
     inverse = 1.0 / math.sqrt(vx * vx + vy * vy + vz * vz)
     ux, uy, uz = vx * inverse, vy * inverse, vz * inverse
@@ -202,13 +206,13 @@ def _observe(k, point, tracks, views, optics, with_interface, out):
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", inline="always")
-def _by_world_point(row, rotation, values):
-    """A row of the derivative by the point in the world."""
+def _by_world_point(row, rotation, i, values):
+    """A row of the derivative by the point in the world, for image `i`."""
     a0, a1, a2 = values[_BY_POINT + 3 * row], values[_BY_POINT + 3 * row + 1], values[_BY_POINT + 3 * row + 2]
     return (
-        a0 * rotation[0, 0] + a1 * rotation[1, 0] + a2 * rotation[2, 0],
-        a0 * rotation[0, 1] + a1 * rotation[1, 1] + a2 * rotation[2, 1],
-        a0 * rotation[0, 2] + a1 * rotation[1, 2] + a2 * rotation[2, 2],
+        a0 * rotation[i, 0, 0] + a1 * rotation[i, 1, 0] + a2 * rotation[i, 2, 0],
+        a0 * rotation[i, 0, 1] + a1 * rotation[i, 1, 1] + a2 * rotation[i, 2, 1],
+        a0 * rotation[i, 0, 2] + a1 * rotation[i, 1, 2] + a2 * rotation[i, 2, 2],
     )
 
 
@@ -225,9 +229,9 @@ def _point_system(point, anchor_weight, anchor, first, stop, tracks, views, opti
         e0, e1 = values[_RESIDUAL], values[_RESIDUAL + 1]
         rho, weight = _robust(e0 * e0 + e1 * e1, loss, scale)
         cost += 0.5 * rho
-        rotation = views.rotation[tracks.image[k]]
+        i = tracks.image[k]
         for row in range(2):
-            b0, b1, b2 = _by_world_point(row, rotation, values)
+            b0, b1, b2 = _by_world_point(row, views.rotation, i, values)
             e = weight * values[_RESIDUAL + row]
             gradient[0] += e * b0
             gradient[1] += e * b1
@@ -339,12 +343,12 @@ def settle(points, anchors, first_track, stop_track, tracks, views, optics, loss
 def _by_blocks(k, values, tracks, views, widths, out):
     """The derivative of observation `k` by the blocks of its image, into `out` (4, 2, width)."""
     i = tracks.image[k]
-    columns = views.columns[i]
+    pose_map, plane_map, columns = views.pose_map, views.plane_map, views.columns
     for row in range(2):
         j0, j1, j2 = values[_BY_POINT + 3 * row], values[_BY_POINT + 3 * row + 1], values[_BY_POINT + 3 * row + 2]
         n0, n1, n2 = values[_BY_NORMAL + 3 * row], values[_BY_NORMAL + 3 * row + 1], values[_BY_NORMAL + 3 * row + 2]
         by_distance = values[_BY_DISTANCE + row]
-        if columns[POSE] >= 0:
+        if columns[i, POSE] >= 0:
             x, y, z = values[_IN_CAM], values[_IN_CAM + 1], values[_IN_CAM + 2]
             # Local rotation: x_cam changes by omega x x_cam; a plane fixed in the world moves along.
             r0, r1, r2 = y * j2 - z * j1, z * j0 - x * j2, x * j1 - y * j0
@@ -357,49 +361,85 @@ def _by_blocks(k, values, tracks, views, widths, out):
                 t0 += by_distance * nx
                 t1 += by_distance * ny
                 t2 += by_distance * nz
-            pose_map = views.pose_map[i]
             for j in range(6):
                 out[POSE, row, j] = (
-                    r0 * pose_map[0, j] + r1 * pose_map[1, j] + r2 * pose_map[2, j]
-                    + t0 * pose_map[3, j] + t1 * pose_map[4, j] + t2 * pose_map[5, j]
+                    r0 * pose_map[i, 0, j] + r1 * pose_map[i, 1, j] + r2 * pose_map[i, 2, j]
+                    + t0 * pose_map[i, 3, j] + t1 * pose_map[i, 4, j] + t2 * pose_map[i, 5, j]
                 )  # fmt: skip
-        if columns[PLANE] >= 0:
-            plane_map = views.plane_map[i]
+        if columns[i, PLANE] >= 0:
             for j in range(3):
                 out[PLANE, row, j] = (
-                    n0 * plane_map[0, j] + n1 * plane_map[1, j] + n2 * plane_map[2, j] + by_distance * plane_map[3, j]
+                    n0 * plane_map[i, 0, j] + n1 * plane_map[i, 1, j] + n2 * plane_map[i, 2, j] + by_distance * plane_map[i, 3, j]
                 )
-        if columns[MEDIUM] >= 0:
+        if columns[i, MEDIUM] >= 0:
             out[MEDIUM, row, 0] = values[_BY_INDEX + row]
-        if columns[LENS] >= 0:
+        if columns[i, LENS] >= 0:
             for j in range(widths[LENS]):
                 out[LENS, row, j] = tracks.lens[k, row, j]
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", inline="always")
-def _subtract_outer(matrix, row, column, a, b, height, width):
-    """`matrix[row:, column:] -= a^T b` for a (3, height) and b (3, width)."""
-    if height == 6 and width == 6:
-        # The common case, with constant bounds so that the compiler unrolls it.
-        for i in range(6):
-            a0, a1, a2 = a[0, i], a[1, i], a[2, i]
-            for j in range(6):
-                matrix[row + i, column + j] -= a0 * b[0, j] + a1 * b[1, j] + a2 * b[2, j]
+def _subtract_outer(matrix, row, column, factors, a, b, height, width):
+    """`matrix[row:, column:] -= A^T B` for the factors A (3, height) and B (3, width) of blocks a and b.
+
+    Six columns are written out, read before they are written: the compiler cannot know that the arrays do not
+    overlap, and would otherwise go one number at a time.
+    """
+    if width == 6:
+        b00, b01, b02, b03, b04, b05 = (
+            factors[b, 0, 0], factors[b, 0, 1], factors[b, 0, 2], factors[b, 0, 3], factors[b, 0, 4], factors[b, 0, 5],
+        )
+        b10, b11, b12, b13, b14, b15 = (
+            factors[b, 1, 0], factors[b, 1, 1], factors[b, 1, 2], factors[b, 1, 3], factors[b, 1, 4], factors[b, 1, 5],
+        )
+        b20, b21, b22, b23, b24, b25 = (
+            factors[b, 2, 0], factors[b, 2, 1], factors[b, 2, 2], factors[b, 2, 3], factors[b, 2, 4], factors[b, 2, 5],
+        )
+        for i in range(height):
+            a0, a1, a2 = factors[a, 0, i], factors[a, 1, i], factors[a, 2, i]
+            r = row + i
+            m0 = matrix[r, column + 0] - (a0 * b00 + a1 * b10 + a2 * b20)
+            m1 = matrix[r, column + 1] - (a0 * b01 + a1 * b11 + a2 * b21)
+            m2 = matrix[r, column + 2] - (a0 * b02 + a1 * b12 + a2 * b22)
+            m3 = matrix[r, column + 3] - (a0 * b03 + a1 * b13 + a2 * b23)
+            m4 = matrix[r, column + 4] - (a0 * b04 + a1 * b14 + a2 * b24)
+            m5 = matrix[r, column + 5] - (a0 * b05 + a1 * b15 + a2 * b25)
+            matrix[r, column + 0] = m0
+            matrix[r, column + 1] = m1
+            matrix[r, column + 2] = m2
+            matrix[r, column + 3] = m3
+            matrix[r, column + 4] = m4
+            matrix[r, column + 5] = m5
     elif width == 3:
         for i in range(height):
-            a0, a1, a2 = a[0, i], a[1, i], a[2, i]
+            a0, a1, a2 = factors[a, 0, i], factors[a, 1, i], factors[a, 2, i]
             for j in range(3):
-                matrix[row + i, column + j] -= a0 * b[0, j] + a1 * b[1, j] + a2 * b[2, j]
-    elif width == 6:
-        for i in range(height):
-            a0, a1, a2 = a[0, i], a[1, i], a[2, i]
-            for j in range(6):
-                matrix[row + i, column + j] -= a0 * b[0, j] + a1 * b[1, j] + a2 * b[2, j]
+                matrix[row + i, column + j] -= a0 * factors[b, 0, j] + a1 * factors[b, 1, j] + a2 * factors[b, 2, j]
     else:
         for i in range(height):
-            a0, a1, a2 = a[0, i], a[1, i], a[2, i]
+            a0, a1, a2 = factors[a, 0, i], factors[a, 1, i], factors[a, 2, i]
             for j in range(width):
-                matrix[row + i, column + j] -= a0 * b[0, j] + a1 * b[1, j] + a2 * b[2, j]
+                matrix[row + i, column + j] -= a0 * factors[b, 0, j] + a1 * factors[b, 1, j] + a2 * factors[b, 2, j]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", inline="always")
+def _add_outer(matrix, row, column, weight, by_blocks, a, b, height, width):
+    """`matrix[row:, column:] += weight A^T B` for the derivatives A (2, height) and B (2, width) by slots a and b."""
+    if height == 6 and width == 6:
+        for i in range(6):
+            a0, a1 = weight * by_blocks[a, 0, i], weight * by_blocks[a, 1, i]
+            for j in range(6):
+                matrix[row + i, column + j] += a0 * by_blocks[b, 0, j] + a1 * by_blocks[b, 1, j]
+    elif width == 3:
+        for i in range(height):
+            a0, a1 = weight * by_blocks[a, 0, i], weight * by_blocks[a, 1, i]
+            for j in range(3):
+                matrix[row + i, column + j] += a0 * by_blocks[b, 0, j] + a1 * by_blocks[b, 1, j]
+    else:
+        for i in range(height):
+            a0, a1 = weight * by_blocks[a, 0, i], weight * by_blocks[a, 1, i]
+            for j in range(width):
+                matrix[row + i, column + j] += a0 * by_blocks[b, 0, j] + a1 * by_blocks[b, 1, j]
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
@@ -449,9 +489,8 @@ def reduce(points, hold_points, anchors, first_track, stop_track, tracks, views,
             e0, e1 = values[_RESIDUAL], values[_RESIDUAL + 1]
             rho, weight = _robust(e0 * e0 + e1 * e1, loss, scale)
             total += 0.5 * rho
-            rotation = views.rotation[i]
-            b00, b01, b02 = _by_world_point(0, rotation, values)
-            b10, b11, b12 = _by_world_point(1, rotation, values)
+            b00, b01, b02 = _by_world_point(0, views.rotation, i, values)
+            b10, b11, b12 = _by_world_point(1, views.rotation, i, values)
             v[0] += weight * (b00 * b00 + b10 * b10)
             v[1] += weight * (b00 * b01 + b10 * b11)
             v[2] += weight * (b00 * b02 + b10 * b12)
@@ -489,13 +528,7 @@ def reduce(points, hold_points, anchors, first_track, stop_track, tracks, views,
                     other_column = views.columns[i, other]
                     if other_column < column:
                         continue
-                    for j in range(width):
-                        a0 = weight * by_blocks[slot, 0, j]
-                        a1 = weight * by_blocks[slot, 1, j]
-                        for m in range(widths[other]):
-                            matrix[column + j, other_column + m] += (
-                                a0 * by_blocks[other, 0, m] + a1 * by_blocks[other, 1, m]
-                            )
+                    _add_outer(matrix, column, other_column, weight, by_blocks, slot, other, width, widths[other])
         if not hold_points:
             weight = anchors.weight[p]
             if weight > 0.0:
@@ -520,9 +553,7 @@ def reduce(points, hold_points, anchors, first_track, stop_track, tracks, views,
                 width = touched_width[a]
                 for b in range(num_touched):
                     if touched_column[b] >= column:
-                        _subtract_outer(
-                            matrix, column, touched_column[b], coupling[a], coupling[b], width, touched_width[b]
-                        )
+                        _subtract_outer(matrix, column, touched_column[b], coupling, a, b, width, touched_width[b])
         for a in range(num_touched):
             place[touched_column[a]] = -1
     return total

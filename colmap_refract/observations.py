@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 _STEP = 1e-4
 """Radians, of the central differences: error and rounding both stay below 1e-7 of the derivative."""
+_ROUND_TRIP = 0.01
+"""Pixels that a lifted keypoint may be off when it is projected again."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,10 +167,14 @@ def lift(observations: Observations) -> Observations:
     camera_of = observations.image_camera[observations.image]
     for c, camera in enumerate(observations.cameras):
         mine = np.flatnonzero(camera_of == c)
-        direction[mine] = camera.cam_ray_from_img(observations.pixel[mine])
+        pixel = observations.pixel[mine]
+        ray = np.asarray(camera.cam_ray_from_img(pixel))
+        # Beyond what a model can invert, COLMAP returns a ray all the same, which does not lead back.
+        off = np.abs(_shortest(camera, np.asarray(camera.img_from_cam(ray)) - pixel)).max(axis=1, initial=0.0)
+        direction[mine] = np.where((off < _ROUND_TRIP)[:, None], ray, np.nan)
         metric[mine] = pixel_metric(camera, direction[mine])
     lifted = replace(observations, direction=direction, metric=metric)
-    fine = np.isfinite(direction).all(axis=1) & np.isfinite(metric).all(axis=(1, 2))
+    fine: NDArray[np.bool_] = np.isfinite(direction).all(axis=1) & np.isfinite(metric).all(axis=(1, 2))
     return replace(lifted.select(fine), num_unliftable=int((~fine).sum()))
 
 

@@ -38,6 +38,10 @@ FAST = {"contract", "reassoc", "nsz", "arcp"}
 _MAX_NEWTON_STEPS = 40
 _NEWTON_TOLERANCE = 1e-7
 """Newton converges quadratically: after a step as small as this the error is of rounding size."""
+_HALLEY_TOLERANCE = 1e-5
+"""Halley converges cubically."""
+_HALLEY_RANGE = 0.1
+"""Relative step below which Halley's method is safe where Newton's is monotonic."""
 
 
 class Media:
@@ -86,27 +90,6 @@ def snell_root(z, s, distance, ratio, walls):
     if not paraxial > 0.0:
         return np.nan, h
     g = 1.0 / paraxial
-    if last == 1:
-        # One interface, the usual case: the same iteration without the loop over layers.
-        first, r = distance * ratio[0], h * ratio[1]
-        c_first, c = s * (1.0 - ratio[0]) * (1.0 + ratio[0]), s * (1.0 - ratio[1]) * (1.0 + ratio[1])
-        for _ in range(_MAX_NEWTON_STEPS):
-            g2 = g * g
-            q = 1.0 / (1.0 + c * g2)
-            behind = r * math.sqrt(q)
-            before, by_before = first, first
-            if c_first > 0.0:
-                q_first = 1.0 / (1.0 + c_first * g2)
-                before = first * math.sqrt(q_first)
-                by_before = before * q_first
-            slope = by_before + behind * q
-            step = ((before + behind) * g - 1.0) / slope
-            if not slope > 0.0:
-                return np.nan, h
-            g -= step
-            if abs(step) <= _NEWTON_TOLERANCE * g:
-                break
-        return g, h
     for _ in range(_MAX_NEWTON_STEPS):
         sg2 = s * g * g
         value = -1.0
@@ -125,6 +108,52 @@ def snell_root(z, s, distance, ratio, walls):
         if abs(step) <= _NEWTON_TOLERANCE * g:
             break
     return g, h
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", inline="always")
+def one_interface(z, s, distance, r, r_by_index):
+    """`snell_root` and `slope_derivatives` in one for a single interface before a denser medium, the usual case.
+
+    Args:
+        z, s, distance: as for `snell_root`.
+        r, r_by_index: ratio of the water, < 1, and its derivative by the index.
+
+    Returns:
+        `(G, G_s, G_z, G_d, G_index)`, the first NaN where no ray exists.
+    """
+    h = z - distance
+    behind = h * r
+    paraxial = distance + behind
+    if not paraxial > 0.0:
+        return np.nan, 0.0, 0.0, 0.0, 0.0
+    g = 1.0 / paraxial
+    c = (1.0 - r) * (1.0 + r)
+    cs = c * s
+    for _ in range(_MAX_NEWTON_STEPS):
+        q = 1.0 / (1.0 + cs * g * g)
+        term = behind * math.sqrt(q)
+        value = (distance + term) * g - 1.0
+        slope = distance + term * q
+        step = value / slope
+        near = abs(step) <= _HALLEY_RANGE * g
+        if near:
+            # Halley's method near the root: the second derivative is at hand, and a step fewer is a root fewer.
+            step /= 1.0 + 1.5 * step * cs * g * term * q * q / slope
+        g -= step
+        if near and abs(step) <= _HALLEY_TOLERANCE * g:
+            break
+    q = 1.0 / (1.0 + cs * g * g)
+    root = math.sqrt(q)
+    cube = h * root * q
+    inverse = 1.0 / (distance + r * cube)
+    by_last = r * g * root
+    return (
+        g,
+        0.5 * r * c * g * g * g * cube * inverse,
+        -by_last * inverse,
+        (by_last - g) * inverse,
+        -r_by_index * g * (1.0 + s * g * g) * cube * inverse,
+    )
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", inline="always")
@@ -277,6 +306,7 @@ def back_project(
     ray = refract(direction, surface, layers.index[0])
     for k, thickness in enumerate(layers.thickness):
         cosine = np.einsum("ij,ij->i", ray, normals)[:, None]
-        origin = origin + thickness / cosine * ray
+        with np.errstate(divide="ignore", invalid="ignore"):
+            origin = origin + thickness / cosine * ray
         ray = refract(ray, normals, layers.index[k + 1] / layers.index[k])
     return origin, ray

@@ -403,7 +403,7 @@ def settle_each(chunk: Chunk, parameters: list[Array], points: Array) -> tuple[A
     return moved, np.array(costs)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(
     seed=st.integers(0, 2**16),
     loss=st.sampled_from(LOSSES),

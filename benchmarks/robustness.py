@@ -1,0 +1,324 @@
+"""Whether the minimum depends on where the interface starts: on real tracks put under water, and in narrow views.
+
+python benchmarks/robustness.py [--data PATH]
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from tables import RESULTS, ProgressLine, publish, table
+
+from colmap_refract.errors import RefractError
+from colmap_refract.options import RefinerOptions, Scenario
+from colmap_refract.refinement import Refinement, refine
+from colmap_refract.simulation import SceneOptions, ignore_refraction, noise_bound, point_rmse, simulate
+
+Array = NDArray[np.float64]
+
+TITLE = "Robustness"
+DEFAULT_DATA = Path(__file__).parents[2] / "shared" / "data"
+STARTS = (0.2, 0.5, 0.8)
+HOUSING_RATIO = 0.012
+HOUSING_FACTORS = (0.5, 1.0, 2.0, 4.0)
+# Median distance to the truth, in median depths, that a prototype of the estimator reached on the real models.
+PROTOTYPE: dict[str, float] = {
+    "static_interface": 0.000123,
+    "moving_interface": 0.000119,
+    "camera_housing": 0.000087,
+}
+LEAST_KEPT = 0.97
+NARROW_FOCAL_LENGTH = 11440.0
+NARROW_SCENES: dict[Scenario, float | None] = {
+    "static_interface": None,
+    "moving_interface": None,
+    "fixed_camera": None,
+    "camera_housing": 0.4,
+}
+NARROW_NOISES = (0.02, 0.1)
+LARGEST_SPREAD = 0.1
+"""Of the reference image's interface distance between starts, in its standard deviations."""
+LARGEST_QUIET_RATIO = 2.0
+"""Of RMSE to the bound, for a result that comes without any warning."""
+
+REAL = """\
+## Real tracks
+
+{name}: poses, tracks and residuals of a real model, wrong matches included, under water. *Start* is the interface
+distance in median depths (for the housing, in multiples of the true one). Errors are median distances to the true
+points after a similarity alignment to the best 90 % of the points, in millionths of the median depth: over all points
+that were kept, and over the best 90 %. *Interface* is how far the reference image's distance is from where the
+default start ends, in standard deviations."""
+SKIPPED = """\
+## Real tracks
+
+Skipped: there is no model at `{path}`. Give `--data` a folder of folders with `sparse/0` (a COLMAP model that ignored
+refraction) and `truth.npz` (`point3D_ids`, `points`, `names`, `planes` of normal and distance per image, `cam_from_world`, `scenario`).
+To make one, take the images of any COLMAP model, project its points through a plane (as
+`colmap_refract.simulation` does), add each observation's own residual, and bundle-adjust the result with the intrinsics held."""
+NARROW = """\
+## Narrow view
+
+Simulated scenes seen through a lens of 8 degrees, the interface unknown (in the housing at {housing} of the depth). *Spread* is the
+largest difference of the reference image's interface distance between the starts, in standard deviations."""
+UNDETERMINED = """\
+## Where the interface is not determined
+
+A lens of 8 degrees in a housing with the port at 0.02 of the depth, 0.5 px of noise: refraction looks like a longer
+focal length there, and the distance cannot be told. What the user is told:"""
+
+
+@dataclass
+class Findings:
+    """Rows of a table, and the limits that they miss."""
+
+    rows: list[list[str]] = field(default_factory=list)
+    missed: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RealModel:
+    """A real model put under water, and the truth.
+
+    Attributes:
+        name: of its folder.
+        scenario: of the interface.
+        reconstruction: the model that ignores refraction.
+        points: true positions by point id.
+        depth: median over the observations, units of the truth.
+    """
+
+    name: str
+    scenario: Scenario
+    reconstruction: pycolmap.Reconstruction
+    points: dict[int, Array]
+    depth: float
+
+
+def read_real_model(folder: Path) -> RealModel:
+    model = pycolmap.Reconstruction(str(folder / "sparse" / "0"))
+    with np.load(folder / "truth.npz") as truth:
+        points = dict(zip(truth["point3D_ids"].tolist(), truth["points"], strict=True))
+        poses = dict(zip(truth["names"].tolist(), truth["cam_from_world"], strict=True))
+        scenario: Scenario = str(truth["scenario"])  # type: ignore[assignment]
+    depths = []
+    for image in model.images.values():
+        axis = poses[image.name][2]
+        seen = np.array([points[point2D.point3D_id] for point2D in image.get_observation_points2D()])
+        depths.append(seen @ axis[:3] + axis[3])
+    return RealModel(
+        name=folder.name,
+        scenario=scenario,
+        reconstruction=model,
+        points=points,
+        depth=float(np.median(np.concatenate(depths))),
+    )
+
+
+def aligned_errors(source: Array, target: Array) -> Array:
+    """Distances (N,) after the similarity that brings the best 90 % of the points (N, 3) to their targets."""
+    # Runaway points would spoil a first alignment, and they are far from the others.
+    error = np.linalg.norm(source - np.median(source, axis=0), axis=1)
+    for _ in range(50):
+        best = np.argsort(error)[: int(0.9 * len(error))]
+        similarity = pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), np.zeros(3))
+        similarity = pycolmap.estimate_sim3d(source[best], target[best]) or similarity
+        error = np.linalg.norm(similarity * source - target, axis=1)
+    return error
+
+
+def errors_in_depths(real: RealModel, model: pycolmap.Reconstruction) -> Array:
+    """Distances (N,) of a model's points to the truth, in median depths."""
+    ids = sorted(model.point3D_ids())
+    source = np.array([model.point3D(i).xyz for i in ids])
+    return aligned_errors(source, np.array([real.points[i] for i in ids])) / real.depth
+
+
+def median_of_best(errors: Array) -> float:
+    return float(np.median(np.sort(errors)[: int(0.9 * len(errors))]))
+
+
+def reference_distance(result: Refinement) -> tuple[float, float]:
+    """Distance of the reference image's interface and its standard deviation, model units."""
+    image = result.sidecar.images[result.sidecar.solver["reference_image"]]
+    assert image.distance is not None
+    return image.distance, image.distance_std if image.distance_std is not None else math.nan
+
+
+def attempt(reconstruction: pycolmap.Reconstruction, options: RefinerOptions) -> Refinement | str:
+    """The refinement, or what the user is told instead."""
+    try:
+        return refine(reconstruction, options)
+    except RefractError as error:
+        return str(error)
+
+
+def real_starts(scenario: Scenario) -> list[tuple[str, float | None]]:
+    """Labels and `initial_distance_ratio` of the starts; the default first."""
+    if scenario == "camera_housing":
+        return [("default", None), *((f"{factor:g} x true", factor * HOUSING_RATIO) for factor in HOUSING_FACTORS)]
+    return [("default", None), *((f"{ratio:g}", ratio) for ratio in STARTS)]
+
+
+def from_all_starts(real: RealModel, line: ProgressLine, findings: Findings) -> None:
+    """Refine a real model from every start."""
+    before = errors_in_depths(real, real.reconstruction)
+    home: float | None = None
+    for label, ratio in real_starts(real.scenario):
+        line.step(f"{real.name}, start {label}")
+        who = f"{real.name}, start {label}"
+        result = attempt(real.reconstruction, RefinerOptions(scenario=real.scenario, initial_distance_ratio=ratio))
+        if isinstance(result, str):
+            findings.missed.append(f"{who}: {result}")
+            findings.rows.append([real.scenario, label, *("-" * 9), "no"])
+            continue
+        after = errors_in_depths(real, result.reconstruction)
+        kept = len(after) / len(before)
+        distance, deviation = reference_distance(result)
+        home = distance if home is None else home
+        moved = (distance - home) / deviation
+        solver = result.sidecar.solver
+        findings.rows.append([
+            real.scenario, label, f"{1e6 * np.median(before):.0f}", f"{1e6 * median_of_best(before):.0f}",
+            f"{1e6 * np.median(after):.1f}", f"{1e6 * median_of_best(after):.1f}",
+            f"{1e6 * PROTOTYPE.get(real.scenario, math.nan):.0f}", f"{100 * kept:.2f}", f"{solver['cost']:.2f}",
+            f"{moved:+.3f}", str(solver["num_iterations"]), "yes" if result.converged else "no",
+        ])  # fmt: skip
+        if not np.median(after) <= PROTOTYPE.get(real.scenario, math.inf):
+            findings.missed.append(
+                f"{who}: median error {1e6 * np.median(after):.1f} millionths, the prototype's is "
+                f"{1e6 * PROTOTYPE[real.scenario]:.0f}"
+            )
+        if kept < LEAST_KEPT:
+            findings.missed.append(f"{who}: {100 * kept:.1f} % of the points kept, less than {100 * LEAST_KEPT:.0f}")
+        if not abs(moved) <= LARGEST_SPREAD:
+            findings.missed.append(f"{who}: the interface is {moved:+.2f} standard deviations from the default start's")
+        if not result.converged:
+            findings.missed.append(f"{who}: the solver did not converge")
+
+
+def real_section(data: Path, line: ProgressLine) -> tuple[str, list[str]]:
+    folders = real_folders(data)
+    if not folders:
+        shown = data.name if data.is_absolute() else data
+        return SKIPPED.format(path=shown), []
+    findings = Findings()
+    for folder in folders:
+        from_all_starts(read_real_model(folder), line, findings)
+    header = [
+        "scenario", "start", "error before, all", "best 90 %", "error after, all", "best 90 %", "prototype, all",
+        "points kept [%]", "cost [px^2]", "interface [sigma]", "iterations", "converged",
+    ]  # fmt: skip
+    names = ", ".join(f"`{folder.name}`" for folder in folders)
+    return f"{REAL.format(name=names)}\n\n{table(header, findings.rows)}", findings.missed
+
+
+def real_folders(data: Path) -> list[Path]:
+    return sorted(truth.parent for truth in data.glob("*/truth.npz") if (truth.parent / "sparse" / "0").is_dir())
+
+
+def narrow_view(scenario: Scenario, noise: float, line: ProgressLine, findings: Findings) -> None:
+    """Refine one scene from every start."""
+    capture = simulate(
+        SceneOptions(
+            scenario=scenario,
+            focal_length=NARROW_FOCAL_LENGTH,
+            pixel_noise=noise,
+            distance_ratio=NARROW_SCENES[scenario],
+        )
+    )
+    start, bound = ignore_refraction(capture), noise_bound(capture)
+    results = []
+    for ratio in STARTS:
+        line.step(f"narrow view, {scenario}, {noise:g} px, start {ratio:g}")
+        results.append(attempt(start, RefinerOptions(scenario=scenario, initial_distance_ratio=ratio)))
+    ends = [reference_distance(result) for result in results if not isinstance(result, str)]
+    spread = float(np.ptp([distance for distance, _ in ends]) / np.median([s for _, s in ends])) if ends else math.nan
+    who = f"narrow view, {scenario}, {noise:g} px"
+    if not spread <= LARGEST_SPREAD:
+        findings.missed.append(f"{who}: the starts end {spread:.3g} standard deviations of the interface apart")
+    for ratio, result in zip(STARTS, results, strict=True):
+        head = [scenario, f"{noise:g}", f"{ratio:g}", f"{point_rmse(start, capture) / bound:.1f}"]
+        if isinstance(result, str):
+            findings.missed.append(f"{who}, start {ratio:g}: {result}")
+            findings.rows.append([*head, *("-" * 8), "no"])
+            continue
+        accuracy = point_rmse(result.reconstruction, capture) / bound
+        distance, deviation = reference_distance(result)
+        kept = result.reconstruction.num_points3D() / start.num_points3D()
+        solver = result.sidecar.solver
+        findings.rows.append([
+            *head, f"{accuracy:.3f}", f"{100 * kept:.1f}", f"{solver['cost']:.6g}", f"{distance:.4f}",
+            f"{deviation:.4f}", f"{spread:.3f}", str(solver["num_iterations"]), str(len(result.warnings)),
+            "yes" if result.converged else "no",
+        ])  # fmt: skip
+        if not result.converged:
+            findings.missed.append(f"{who}, start {ratio:g}: the solver did not converge")
+        if accuracy > LARGEST_QUIET_RATIO and not result.warnings:
+            findings.missed.append(f"{who}, start {ratio:g}: RMSE / bound is {accuracy:.3g}, without a warning")
+
+
+def narrow_section(line: ProgressLine) -> tuple[str, list[str]]:
+    findings = Findings()
+    for scenario in NARROW_SCENES:
+        for noise in NARROW_NOISES:
+            narrow_view(scenario, noise, line, findings)
+    header = [
+        "scenario", "noise [px]", "start", "RMSE / bound before", "after", "points kept [%]", "cost [px^2]",
+        "interface [m]", "sigma [m]", "spread [sigma]", "iterations", "warnings", "converged",
+    ]  # fmt: skip
+    intro = NARROW.format(housing=NARROW_SCENES["camera_housing"])
+    return f"{intro}\n\n{table(header, findings.rows)}", findings.missed
+
+
+def undetermined_section(line: ProgressLine) -> tuple[str, list[str]]:
+    """What is said where an interface cannot be found."""
+    line.step("undetermined interface")
+    options = SceneOptions(scenario="camera_housing", focal_length=NARROW_FOCAL_LENGTH, distance_ratio=0.02)
+    capture = simulate(options)
+    result = attempt(ignore_refraction(capture), RefinerOptions(scenario="camera_housing"))
+    if isinstance(result, str):
+        return f"{UNDETERMINED}\n\n> ERROR: {result}", []
+    accuracy = point_rmse(result.reconstruction, capture) / noise_bound(capture)
+    ended = f"A model is written, its RMSE {accuracy:.2f} of the bound."
+    if not result.warnings:
+        return f"{UNDETERMINED} nothing. {ended}", ["undetermined interface: no error and no warning"]
+    said = "\n>\n".join(f"> WARNING: {sentence}" for sentence in result.warnings)
+    return f"{UNDETERMINED}\n\n{said}\n\n{ended}", []
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--data",
+        type=Path,
+        default=DEFAULT_DATA,
+        help="folder of real models put under water, each with sparse/0 and truth.npz (../shared/data)",
+    )
+    parser.add_argument("--output_path", type=Path, default=RESULTS / "robustness.md", help="Markdown file to write")
+    arguments = parser.parse_args()
+    data: Path = arguments.data
+    if data != DEFAULT_DATA and not real_folders(data):
+        parser.error(f"--data {data}: no folder with sparse/0 and truth.npz there")
+    steps = sum(len(HOUSING_FACTORS if "housing" in folder.name else STARTS) + 1 for folder in real_folders(data))
+    line = ProgressLine(steps + len(NARROW_SCENES) * len(NARROW_NOISES) * len(STARTS) + 1)
+    parts: Sequence[tuple[str, list[str]]] = [
+        real_section(data, line),
+        narrow_section(line),
+        undetermined_section(line),
+    ]
+    line.clear()
+    missed = [sentence for _, found in parts for sentence in found]
+    return publish(arguments.output_path, TITLE, [section for section, _ in parts], missed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
