@@ -19,9 +19,9 @@ from tables import RESULTS, ProgressLine, publish, table
 from colmap_refract.adjustment import SolverSettings, adjust
 from colmap_refract.arrangement import arrange
 from colmap_refract.errors import RefractError
-from colmap_refract.interface import plane_in_world
+from colmap_refract.interface import Array, plane_in_world
 from colmap_refract.observations import read_observations
-from colmap_refract.options import ImageNotes, RefinerOptions, Scenario
+from colmap_refract.options import ImageNotes, Loss, RefinerOptions, Scenario
 from colmap_refract.refinement import Refinement, refine
 from colmap_refract.simulation import Capture, SceneOptions, ignore_refraction, noise_bound, point_rmse, simulate
 
@@ -87,22 +87,34 @@ def with_outliers(capture: Capture, ratio: float) -> Capture:
     return replace(capture, options=replace(options, outlier_ratio=ratio), reconstruction=model, outliers=outliers)
 
 
-def least_squares(capture: Capture) -> pycolmap.Reconstruction:
-    """The minimum, nearest to the truth, of the squared residuals of all but the outliers, in a frame of its own."""
-    model = pycolmap.Reconstruction(capture.reconstruction)
-    for outlier in capture.outliers:
-        # Which removes the point with the last observation but one.
-        if model.image(outlier[0]).point2D(outlier[1]).has_point3D():
-            model.delete_observation(*outlier)
+def minimum_at_truth(
+    model: pycolmap.Reconstruction,
+    planes: dict[int, tuple[Array, float]],
+    scenario: Scenario,
+    *,
+    loss: Loss = "trivial",
+    loss_scale: float = 1.0,
+) -> tuple[pycolmap.Reconstruction, float]:
+    """The minimum nearest to the truth, all observations kept.
+
+    Args:
+        model: true poses, points and intrinsics, and the keypoints to fit.
+        planes: `(normal_in_cam, distance)` by image id, the truth.
+        scenario: how images share them.
+        loss, loss_scale: the robust loss, and its scale in px.
+
+    Returns:
+        The model with its points there, in a frame and size of their own, and the cost in px^2.
+    """
     observations = read_observations(model)
-    arrangement = arrange(observations, RefinerOptions(scenario=capture.scenario), ImageNotes())
+    arrangement = arrange(observations, RefinerOptions(scenario=scenario), ImageNotes())
     problem = arrangement.start(0.5, arrangement.observations)
     structure, state = problem.structure, problem.state
     rotation, translation = state.cam_from_world(structure)
     normal, distance = state.normal.copy(), state.distance.copy()
     for block in range(structure.num_planes):
         image = int(np.flatnonzero(structure.image_plane == block)[0])
-        true_normal, true_distance = capture.planes[int(observations.image_ids[image])]
+        true_normal, true_distance = planes[int(observations.image_ids[image])]
         normal[block], distance[block] = true_normal, true_distance / arrangement.unit
         if structure.plane_in_world[block]:
             normal[block], offset = plane_in_world(normal[block], distance[block], rotation[image], translation[image])
@@ -111,11 +123,26 @@ def least_squares(capture: Capture) -> pycolmap.Reconstruction:
         problem,
         state=replace(state, normal=normal, distance=distance),
         points=(observations.points - arrangement.origin) / arrangement.unit,
+        loss=loss,
+        loss_scale=loss_scale,
     )
     adjustment = adjust(problem, SolverSettings(function_tolerance=1e-12, max_num_iterations=200))
+    model = pycolmap.Reconstruction(model)
+    for point3D_id in set(model.point3D_ids()) - set(observations.point3D_ids.tolist()):
+        model.delete_point3D(point3D_id)
     for point3D_id, xyz in zip(observations.point3D_ids.tolist(), adjustment.points, strict=True):
         model.point3D(point3D_id).xyz = xyz
-    return model
+    return model, adjustment.cost
+
+
+def least_squares(capture: Capture) -> pycolmap.Reconstruction:
+    """The minimum of the squared residuals of all observations but the outliers."""
+    model = pycolmap.Reconstruction(capture.reconstruction)
+    for outlier in capture.outliers:
+        # The point goes with its last observation but one.
+        if model.image(outlier[0]).point2D(outlier[1]).has_point3D():
+            model.delete_observation(*outlier)
+    return minimum_at_truth(model, capture.planes, capture.scenario)[0]
 
 
 def rmse_over(model: pycolmap.Reconstruction, capture: Capture, reference: pycolmap.Reconstruction) -> float:

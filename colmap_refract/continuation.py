@@ -46,6 +46,8 @@ _PLANE_DEVIATIONS = (0.1, 1.0, 10.0)
 """Of normal priors on moving planes, radians and units of the solve for residuals of one px, let loose in turn."""
 _OPEN_RATIOS = (0.5, 0.15)
 _HOUSING_RATIOS = (0.02, 0.2)
+_PLAUSIBLE_NOISE = 1.0
+"""Pixels, of a keypoint's coordinate: larger residuals let one try another start."""
 _MAX_TURNS = 3
 MIN_DISTANCE = 1e-4
 """Of the median depth: a plane nearer than this has run into the camera."""
@@ -73,6 +75,9 @@ class Start:
 def find_start(arrangement: Arrangement, settings: SolverSettings, watch: Watch | None) -> Start:
     """The best of several start distances, on a selection of tracks; from the options' own if they give one.
 
+    The first that leads to planes between cameras and points, and to residuals as small as keypoints are good,
+    is taken; the minimum behind it is the same.
+
     Raises:
         KeyboardInterrupt: Ctrl-C during a solve.
     """
@@ -88,6 +93,8 @@ def find_start(arrangement: Arrangement, settings: SolverSettings, watch: Watch 
         if start is not None:
             starts.append(start)
             logger.debug("start at %.3g of the depth: cost %.6g, sound %s", ratio, start.cost, start.sound)
+            if start.sound and estimate_noise(start.problem) < _PLAUSIBLE_NOISE:
+                break
     if not starts:
         raise FloatingPointError("no start value could be evaluated")
     return min(starts, key=lambda start: (not start.sound, start.cost))

@@ -17,7 +17,7 @@ from colmap_refract.alignment import Similarity, align_poses, rescale_about
 from colmap_refract.arrangement import Arrangement, arrange
 from colmap_refract.continuation import Watch, named, estimate_noise, find_start, is_sound, retriangulate, spread_out
 from colmap_refract.errors import RefractError
-from colmap_refract.filtering import Filtered, filter_observations, label_wet, pinhole_errors, reprojection_errors
+from colmap_refract.filtering import filter_observations, label_wet, pinhole_errors, reprojection_errors
 from colmap_refract.interface import Array, plane_in_cam
 from colmap_refract.model_io import copy_model
 from colmap_refract.observations import lift, read_observations
@@ -97,12 +97,13 @@ def refine(
     notes = notes or ImageNotes()
     model = copy_model(reconstruction)
     _check_model(model)
-    original = read_observations(model)
-    _replace_cameras(model, cameras or {})
     observations = read_observations(model)
+    before = pinhole_errors(observations)
+    if cameras:
+        _replace_cameras(model, cameras)
+        observations = read_observations(model)
     if not len(observations.points):
         raise RefractError("the model has no point that two registered images see: there is nothing to refine")
-    before = pinhole_errors(original)
     arrangement = arrange(observations, options, notes)
     counts = _Counts(unusable=model.compute_num_observations() - len(observations.image))
     num_threads = options.num_threads if options.num_threads > 0 else len(os.sched_getaffinity(0))
@@ -162,8 +163,6 @@ def _check_model(model: pycolmap.Reconstruction) -> None:
 
 def _replace_cameras(model: pycolmap.Reconstruction, cameras: Mapping[int, pycolmap.Camera]) -> None:
     """In-air intrinsics in place of the model's: keypoints are raw pixels, so that is sound."""
-    if not cameras:
-        return
     for camera_id, camera in model.cameras.items():
         known = next(iter(cameras.values())) if len(cameras) == 1 else cameras.get(camera_id)
         if known is None:
@@ -191,20 +190,21 @@ def _solve(
         _raise_unsound(start.problem)
     problem = spread_out(arrangement, start, settings)
     # The start comes from a few tracks: what it finds wrong by little may be right.
-    limit = _FIRST_FILTER * options.filter_max_reproj_error
+    arrangement, problem, _ = _filter(arrangement, problem, counts, _FIRST_FILTER * options.filter_max_reproj_error)
+    noise = estimate_noise(start.problem)
     for round_ in range(_NUM_FILTER_ROUNDS + 1):
-        arrangement, problem = _filter(arrangement, problem, settings, counts, limit)
-        limit = options.filter_max_reproj_error
         stage = "Refractive bundle adjustment" + (f", filtered {round_ + 1} times" if round_ else "")
-        problem = _with_loss(arrangement, problem, estimate_noise(problem if round_ else start.problem))
+        problem = _with_loss(arrangement, problem, noise)
         adjustment = adjust(problem, settings, on_progress=named(watch, stage))
         problem = replace(problem, state=adjustment.state, points=adjustment.points)
         arrangement, problem, moved = _relift(arrangement, problem)
-        if not (moved or _would_change(arrangement, problem, limit)):
+        arrangement, problem, changed = _filter(arrangement, problem, counts, options.filter_max_reproj_error)
+        if not moved and changed <= _NEGLIGIBLE_CHANGE:
             break
-    # The last few outliers say too little to solve everything again for: their points alone are settled anew.
-    arrangement, problem = _filter(arrangement, problem, settings, counts, limit)
-    problem = replace(problem, points=settle_points(problem, settings))
+        noise = estimate_noise(problem)
+    if changed > 0:
+        # The last few outliers say too little to solve everything again for: their points alone are settled anew.
+        problem = replace(problem, points=settle_points(problem, settings))
     if not is_sound(problem):
         _raise_unsound(problem)
     return arrangement, problem, adjustment
@@ -218,32 +218,22 @@ def _with_loss(arrangement: Arrangement, problem: Problem, noise: float) -> Prob
     return replace(problem, loss=adjustment.loss_function_type, loss_scale=scale)
 
 
-def _marks(arrangement: Arrangement, problem: Problem, limit: float) -> Filtered:
-    options = arrangement.options
-    return filter_observations(
+def _filter(
+    arrangement: Arrangement, problem: Problem, counts: _Counts, limit: float
+) -> tuple[Arrangement, Problem, float]:
+    """Label wet and dry anew, remove outliers over `limit` px, count them; and the part of all that this changed."""
+    wet = label_wet(problem)
+    relabelled = float((wet != problem.tracks.wet).mean())
+    if relabelled > 0:
+        problem = retriangulate(replace(problem, tracks=problem.tracks._replace(wet=wet)))
+    marks = filter_observations(
         problem,
         arrangement.observations,
         max_reproj_error=limit,
-        min_tri_angle=options.min_tri_angle,
+        min_tri_angle=arrangement.options.min_tri_angle,
     )
-
-
-def _would_change(arrangement: Arrangement, problem: Problem, limit: float) -> bool:
-    relabelled = (label_wet(problem) != problem.tracks.wet).mean()
-    removed = 1.0 - _marks(arrangement, problem, limit).keep.mean()
-    return bool(max(relabelled, removed) > _NEGLIGIBLE_CHANGE)
-
-
-def _filter(
-    arrangement: Arrangement, problem: Problem, settings: SolverSettings, counts: _Counts, limit: float
-) -> tuple[Arrangement, Problem]:
-    """Label wet and dry anew, remove outliers, and count them."""
-    wet = label_wet(problem)
-    if (wet != problem.tracks.wet).any():
-        problem = retriangulate(replace(problem, tracks=problem.tracks._replace(wet=wet)))
-    marks = _marks(arrangement, problem, limit)
     if marks.keep.all():
-        return arrangement, problem
+        return arrangement, problem, relabelled
     observations = arrangement.observations.select(marks.keep)
     if not len(observations.points):
         raise RefractError(
@@ -255,8 +245,9 @@ def _filter(
     kept_points = np.isin(arrangement.observations.point3D_ids, observations.point3D_ids)
     kept = marks.keep & np.repeat(kept_points, np.diff(problem.tracks.start))
     arrangement = replace(arrangement, observations=observations)
-    tracks = arrangement.tracks(observations)._replace(wet=problem.tracks.wet[kept])
-    return arrangement, replace(problem, tracks=tracks, points=problem.points[kept_points])
+    tracks = arrangement.tracks(observations)._replace(wet=wet[kept])
+    problem = replace(problem, tracks=tracks, points=problem.points[kept_points])
+    return arrangement, problem, max(relabelled, 1.0 - float(marks.keep.mean()))
 
 
 def _relift(arrangement: Arrangement, problem: Problem) -> tuple[Arrangement, Problem, bool]:
