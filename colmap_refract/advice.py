@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_refract.adjustment import Adjustment, Problem
 from colmap_refract.arrangement import Arrangement
@@ -21,7 +22,7 @@ _OBLIQUE_DEG = 8.0
 
 @dataclass(frozen=True, kw_only=True)
 class Facts:
-    """What is known after a solve; errors in px, noise in px of one coordinate, and whether intrinsics from air were given."""
+    """What is known after a solve: errors and the noise of one coordinate in px, whether the intrinsics are from air."""
 
     arrangement: Arrangement
     problem: Problem
@@ -72,18 +73,18 @@ def _intrinsics(facts: Facts) -> list[str]:
             suspicious.append(str(camera_id))
     if suspicious:
         sentences.append(
-            f"The intrinsics of camera {', '.join(suspicious)} look as if COLMAP had refined them on these images: they have "
-            "then absorbed part of the refraction, and the result is wrong; give intrinsics calibrated in air "
-            "(--camera_path)."
+            f"The intrinsics of camera {', '.join(suspicious)} look as if COLMAP had refined them on these images. If "
+            "so they have absorbed part of the refraction, and the result is wrong: give intrinsics calibrated in "
+            "air (--camera_path)."
         )
     pinhole = facts.pinhole_errors[np.isfinite(facts.pinhole_errors)]
-    if len(pinhole) and facts.arrangement.options.scenario != "fixed_camera":
-        if np.median(pinhole) < 1.05 * np.median(facts.errors):
-            sentences.append(
-                f"Without refraction the model fits as well (median {np.median(pinhole):.3g} px against "
-                f"{np.median(facts.errors):.3g} px): either nothing is refracted here, or the intrinsics have absorbed "
-                "it; give intrinsics calibrated in air (--camera_path) and check --scenario."
-            )
+    moves = facts.arrangement.options.scenario != "fixed_camera"
+    if len(pinhole) and moves and np.median(pinhole) < 1.02 * np.median(facts.errors):
+        sentences.append(
+            f"Without refraction the model fits as well (median {np.median(pinhole):.3g} px against "
+            f"{np.median(facts.errors):.3g} px): either nothing is refracted here, or the intrinsics have absorbed "
+            "it; give intrinsics calibrated in air (--camera_path) and check --scenario."
+        )
     return sentences
 
 
@@ -106,13 +107,14 @@ def _planes(facts: Facts) -> list[str]:
         )
     if len(loose_distance):
         sentences.append(
-            f"The distance of {_how_many(loose_distance, problem)} is uncertain by up to {100 * np.nanmax(relative):.2g} %: "
-            f"{_remedy(facts)}; a known distance helps (--interface_distance, --refine_interface_distance 0)."
+            f"The distance of {_how_many(loose_distance, problem)} is uncertain by up to "
+            f"{100 * np.nanmax(relative):.2g} %: {_remedy(facts)}; a known distance helps (--interface_distance, "
+            "--refine_interface_distance 0)."
         )
     return sentences
 
 
-def _how_many(loose: Array, problem: Problem) -> str:
+def _how_many(loose: NDArray[np.int64], problem: Problem) -> str:
     total = problem.structure.num_planes
     return "the interface" if total == 1 else f"{len(loose)} of {total} interfaces"
 
@@ -140,8 +142,8 @@ def _index(facts: Facts) -> list[str]:
     sigma, correlation = facts.uncertainty.index * facts.noise, facts.uncertainty.index_correlation
     if not np.isfinite(sigma) or sigma > 0.005 or correlation > _CORRELATION_LIMIT:
         return [
-            f"The refractive index {facts.problem.state.index:.4f} (standard deviation {sigma:.2g}, correlation with the "
-            f"interface {correlation:.3f}) cannot be told from the rest: hold it (--refine_refractive_index 0)."
+            f"The refractive index {facts.problem.state.index:.4f} (standard deviation {sigma:.2g}, correlation with "
+            f"the interface {correlation:.3f}) cannot be told from the rest: hold it (--refine_refractive_index 0)."
         ]
     return []
 

@@ -97,7 +97,9 @@ class Arrangement:
             for block in range(structure.num_planes):
                 image = int(np.flatnonzero(structure.image_plane == block)[0])
                 image = self.reference if structure.image_plane[self.reference] == block else image
-                lever = centers[image] - structure.plane_anchor[block] if structure.plane_in_world[block] else np.zeros(3)
+                lever = (
+                    centers[image] - structure.plane_anchor[block] if structure.plane_in_world[block] else np.zeros(3)
+                )
                 distance[block] = ratio + normal[block] @ lever
         num_poses = structure.num_poses
         pose_frame = np.array([int(np.flatnonzero(self.frame_pose == p)[0]) for p in range(num_poses)])
@@ -229,7 +231,8 @@ def _check_names(names: list[str], options: RefinerOptions, notes: ImageNotes) -
     for what, name in mentioned:
         if name not in known:
             raise RefractError(
-                f"{what}: there is no registered image named '{name}' in the model; its images are named like '{names[0]}'"
+                f"{what}: there is no registered image named '{name}' in the model; its images are named like "
+                f"'{names[0]}'"
             )
     both = sorted(set(notes.interface_groups) & notes.dry_images)
     if both:
@@ -251,7 +254,9 @@ def _check_counts(
 ) -> None:
     num_images = len(observations.image_ids)
     if num_images < 2:
-        raise RefractError("the model has one registered image; refraction shows between images: two or more are needed")
+        raise RefractError(
+            "the model has one registered image; refraction shows between images: two or more are needed"
+        )
     needed = min_num_points(scenario, num_images)
     point = observations.point
     for block, name in enumerate(plane_names):
@@ -344,7 +349,9 @@ def _held(structure: Structure, options: RefinerOptions, reference: int, scale_k
         distances=distances,
         points=not adjustment.refine_points3D,
         index=not options.refine_refractive_index,
-        lens=not (adjustment.refine_focal_length or adjustment.refine_principal_point or adjustment.refine_extra_params),
+        lens=not (
+            adjustment.refine_focal_length or adjustment.refine_principal_point or adjustment.refine_extra_params
+        ),
     )
 
 

@@ -189,7 +189,7 @@ def main(arguments: list[str] | None = None) -> int:
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     try:
         command = tyro.cli(
-            Command,  # type: ignore[arg-type]
+            Command,
             prog="colmap-refract",
             description="Refraction-aware refinement of COLMAP models: scenes photographed through a plane interface.",
             args=arguments,

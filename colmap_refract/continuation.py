@@ -243,7 +243,9 @@ def _mirrored(problem: Problem) -> Problem | None:
     points, normals, distances = in_cameras(problem)
     behind = np.einsum("ni,ni->n", points, normals) - distances - sum(problem.layers.thickness)
     block = structure.image_plane[problem.tracks.image]
-    median = np.array([np.median(behind[block == b]) if (block == b).any() else 1.0 for b in range(structure.num_planes)])
+    median = np.array(
+        [np.median(behind[block == b]) if (block == b).any() else 1.0 for b in range(structure.num_planes)]
+    )
     wrong = (median < 0.0) & ~problem.held.normals & ~problem.held.distances
     if not wrong.any() or wrong.all():
         return None
@@ -321,7 +323,7 @@ def _unbend(
     settings: SolverSettings,
     on_progress: Callable[[Progress], None] | None,
 ) -> Problem | None:
-    """A start for planes fixed in the world where the model is bent so much that none fits between its cameras and points.
+    """A start for world planes where the model is so bent that none fits between its cameras and its points.
 
     Every image gets a plane of its own for a while, which takes the bend away; the shared planes are
     then fitted to those.
@@ -334,9 +336,7 @@ def _unbend(
         plane_anchor=np.zeros((structure.num_images, 3)),
     )
     count = structure.num_images
-    state = replace(
-        problem.state, normal=np.tile([0.0, 0.0, 1.0], (count, 1)), distance=np.full(count, ratio)
-    )
+    state = replace(problem.state, normal=np.tile([0.0, 0.0, 1.0], (count, 1)), distance=np.full(count, ratio))
     held = replace(problem.held, normals=np.zeros(count, bool), distances=np.zeros(count, bool), index=True, lens=True)
     own_planes = replace(problem, structure=own, state=state, held=held)
     loose = _widened(retriangulate(_widened(own_planes)))
@@ -367,7 +367,7 @@ def _fixed_camera(
     settings: SolverSettings,
     on_progress: Callable[[Progress], None] | None,
 ) -> Start | None:
-    """Proximal continuation: equal planes give a fixed camera no parallax, so each point is tied to where it was, ever less."""
+    """Equal planes give a fixed camera no parallax, so each point is tied to where it was, less and less."""
     adjusted = None
     for weight in _ANCHORS:
         # At first whole images are far off, by their planes' tilt, and no outliers: they must not lose their weight.
@@ -414,4 +414,3 @@ def named(watch: Watch | None, stage: str) -> Callable[[Progress], None] | None:
     if watch is None:
         return None
     return lambda progress: watch(stage, progress)
-

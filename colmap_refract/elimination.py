@@ -284,7 +284,9 @@ def _settle_point(point, anchor_weight, anchor, first, stop, tracks, views, opti
     """
     values, v, gradient, lower = scratch[0], scratch[1], scratch[2], scratch[3]
     trial, trial_v, trial_gradient = scratch[4], scratch[5], scratch[6]
-    cost = _point_system(point, anchor_weight, anchor, first, stop, tracks, views, optics, loss, scale, values, v, gradient)
+    cost = _point_system(
+        point, anchor_weight, anchor, first, stop, tracks, views, optics, loss, scale, values, v, gradient
+    )
     floor = _SQUARED_PIXEL_FLOOR * (stop - first)
     damping = 0.0
     gain = 0.0
@@ -299,7 +301,19 @@ def _settle_point(point, anchor_weight, anchor, first, stop, tracks, views, opti
         s0 = (y0 - lower[1] * s1 - lower[3] * s2) / lower[0]
         trial[0], trial[1], trial[2] = point[0] - s0, point[1] - s1, point[2] - s2
         trial_cost = _point_system(
-            trial, anchor_weight, anchor, first, stop, tracks, views, optics, loss, scale, values, trial_v, trial_gradient
+            trial,
+            anchor_weight,
+            anchor,
+            first,
+            stop,
+            tracks,
+            views,
+            optics,
+            loss,
+            scale,
+            values,
+            trial_v,
+            trial_gradient,
         )
         if trial_cost < cost:
             cost = trial_cost
@@ -369,7 +383,10 @@ def _by_blocks(k, values, tracks, views, widths, out):
         if columns[i, PLANE] >= 0:
             for j in range(3):
                 out[PLANE, row, j] = (
-                    n0 * plane_map[i, 0, j] + n1 * plane_map[i, 1, j] + n2 * plane_map[i, 2, j] + by_distance * plane_map[i, 3, j]
+                    n0 * plane_map[i, 0, j]
+                    + n1 * plane_map[i, 1, j]
+                    + n2 * plane_map[i, 2, j]
+                    + by_distance * plane_map[i, 3, j]
                 )
         if columns[i, MEDIUM] >= 0:
             out[MEDIUM, row, 0] = values[_BY_INDEX + row]
@@ -387,13 +404,28 @@ def _subtract_outer(matrix, row, column, factors, a, b, height, width):
     """
     if width == 6:
         b00, b01, b02, b03, b04, b05 = (
-            factors[b, 0, 0], factors[b, 0, 1], factors[b, 0, 2], factors[b, 0, 3], factors[b, 0, 4], factors[b, 0, 5],
+            factors[b, 0, 0],
+            factors[b, 0, 1],
+            factors[b, 0, 2],
+            factors[b, 0, 3],
+            factors[b, 0, 4],
+            factors[b, 0, 5],
         )
         b10, b11, b12, b13, b14, b15 = (
-            factors[b, 1, 0], factors[b, 1, 1], factors[b, 1, 2], factors[b, 1, 3], factors[b, 1, 4], factors[b, 1, 5],
+            factors[b, 1, 0],
+            factors[b, 1, 1],
+            factors[b, 1, 2],
+            factors[b, 1, 3],
+            factors[b, 1, 4],
+            factors[b, 1, 5],
         )
         b20, b21, b22, b23, b24, b25 = (
-            factors[b, 2, 0], factors[b, 2, 1], factors[b, 2, 2], factors[b, 2, 3], factors[b, 2, 4], factors[b, 2, 5],
+            factors[b, 2, 0],
+            factors[b, 2, 1],
+            factors[b, 2, 2],
+            factors[b, 2, 3],
+            factors[b, 2, 4],
+            factors[b, 2, 5],
         )
         for i in range(height):
             a0, a1, a2 = factors[a, 0, i], factors[a, 1, i], factors[a, 2, i]

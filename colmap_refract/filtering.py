@@ -87,7 +87,11 @@ def filter_observations(
         large = reprojection_errors(problem, observations) > max_reproj_error
     if min_tri_angle > 0:
         angle = triangulation_angles(
-            problem.tracks, problem.structure, problem.state, problem.layers.with_index(problem.state.index), problem.points
+            problem.tracks,
+            problem.structure,
+            problem.state,
+            problem.layers.with_index(problem.state.index),
+            problem.points,
         )
         small = angle < min_tri_angle
     return Filtered(

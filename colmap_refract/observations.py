@@ -170,11 +170,11 @@ def lift(observations: Observations) -> Observations:
         pixel = observations.pixel[mine]
         ray = np.asarray(camera.cam_ray_from_img(pixel))
         # Beyond what a model can invert, COLMAP returns a ray all the same, which does not lead back.
-        off = np.abs(_shortest(camera, np.asarray(camera.img_from_cam(ray)) - pixel)).max(axis=1, initial=0.0)
+        off = np.abs(_shortest(camera, _project(camera, ray) - pixel)).max(axis=1, initial=0.0)
         direction[mine] = np.where((off < _ROUND_TRIP)[:, None], ray, np.nan)
         metric[mine] = pixel_metric(camera, direction[mine])
     lifted = replace(observations, direction=direction, metric=metric)
-    fine: NDArray[np.bool_] = np.isfinite(direction).all(axis=1) & np.isfinite(metric).all(axis=(1, 2))
+    fine = np.asarray(np.isfinite(direction).all(axis=1) & np.isfinite(metric).all(axis=(1, 2)))
     return replace(lifted.select(fine), num_unliftable=int((~fine).sum()))
 
 
@@ -192,7 +192,7 @@ def pixel_metric(camera: pycolmap.Camera, direction: Array) -> Array:
     metric = np.zeros((len(direction), 2, 3))
     for j in range(2):
         step = _STEP * basis[:, :, j]
-        ahead, behind = camera.img_from_cam(direction + step), camera.img_from_cam(direction - step)
+        ahead, behind = _project(camera, direction + step), _project(camera, direction - step)
         change = _shortest(camera, ahead - behind) / (2.0 * _STEP)
         metric += change[:, :, None] * basis[:, None, :, j]
     return metric
@@ -210,8 +210,8 @@ def lens_jacobian(camera: pycolmap.Camera, direction: Array, parameters: list[in
             moved = pycolmap.Camera(camera.todict())
             params = np.array(moved.params)
             params[index] += sign * step
-            moved.params = params
-            images.append(moved.img_from_cam(direction))
+            moved.params = params.tolist()
+            images.append(_project(moved, direction))
         jacobian[:, :, j] = (images[0] - images[1]) / (2.0 * step)
     return jacobian
 
@@ -222,7 +222,7 @@ def pixel_errors(observations: Observations, direction: Array) -> Array:
     camera_of = observations.image_camera[observations.image]
     for c, camera in enumerate(observations.cameras):
         mine = np.flatnonzero(camera_of == c)
-        change = _shortest(camera, camera.img_from_cam(direction[mine]) - observations.pixel[mine])
+        change = _shortest(camera, _project(camera, direction[mine]) - observations.pixel[mine])
         error[mine] = np.linalg.norm(change, axis=1)
     return np.where(np.isfinite(error), error, np.inf)
 
@@ -236,6 +236,11 @@ def _tangent_bases(direction: Array) -> Array:
     return np.stack([e1, np.cross(direction, e1)], axis=2)
 
 
+def _project(camera: pycolmap.Camera, direction: Array) -> Array:
+    """Pixels (N, 2) of directions (N, 3) in the camera's frame; NaN where it does not see."""
+    return np.asarray(camera.img_from_cam(direction), dtype=np.float64)
+
+
 def _shortest(camera: pycolmap.Camera, change: Array) -> Array:
     """Pixel differences the short way round: a full panorama's left and right edges are one place."""
     if not camera.is_spherical():
@@ -243,5 +248,3 @@ def _shortest(camera: pycolmap.Camera, change: Array) -> Array:
     wrapped = change.copy()
     wrapped[:, 0] -= camera.width * np.round(change[:, 0] / camera.width)
     return wrapped
-
-

@@ -228,7 +228,11 @@ def _project_directions(points, normals, distances, wet, ratio, walls, out):
 
 
 def project_direction(
-    points_in_cam: Array, normal_in_cam: Array, distance: Array | float, layers: Layers, wet: NDArray[np.bool_] | None = None
+    points_in_cam: Array,
+    normal_in_cam: Array,
+    distance: Array | float,
+    layers: Layers,
+    wet: NDArray[np.bool_] | None = None,
 ) -> Array:
     """Unit directions in which a camera sees points through its interface: `FP` of the paper without the lens.
 
@@ -281,7 +285,11 @@ def refract(direction: Array, normal: Array, index_ratio: float) -> Array:
 
 
 def back_project(
-    direction: Array, normal_in_cam: Array, distance: Array | float, layers: Layers, normal_at_point: Array | None = None
+    direction: Array,
+    normal_in_cam: Array,
+    distance: Array | float,
+    layers: Layers,
+    normal_at_point: Array | None = None,
 ) -> tuple[Array, Array]:
     """The ray in the water of a camera direction: `IP` and `RV` of the paper, whose `BP` is `origin + d * direction`.
 

@@ -15,7 +15,16 @@ from colmap_refract.adjustment import Adjustment, Problem, SolverSettings, adjus
 from colmap_refract.advice import Facts, advise
 from colmap_refract.alignment import Similarity, align_poses, rescale_about
 from colmap_refract.arrangement import Arrangement, arrange
-from colmap_refract.continuation import Watch, named, estimate_noise, find_start, is_sound, retriangulate, spread_out
+from colmap_refract.continuation import (
+    MIN_DISTANCE,
+    Watch,
+    estimate_noise,
+    find_start,
+    is_sound,
+    named,
+    retriangulate,
+    spread_out,
+)
 from colmap_refract.errors import RefractError
 from colmap_refract.filtering import filter_observations, label_wet, pinhole_errors, reprojection_errors
 from colmap_refract.interface import Array, plane_in_cam
@@ -116,7 +125,9 @@ def refine(
     try:
         arrangement, problem, adjustment = _solve(arrangement, settings, counts, watch)
     except FloatingPointError as error:
-        raise RefractError(f"the adjustment could not be evaluated ({error}): check the model and the scenario") from None
+        raise RefractError(
+            f"the adjustment could not be evaluated ({error}): check the model and the scenario"
+        ) from None
     solve_seconds = perf_counter() - solve_started
     uncertainty = estimate_uncertainty(problem)
     errors = reprojection_errors(problem, arrangement.observations)
@@ -136,7 +147,9 @@ def refine(
     _write_back(model, arrangement, problem, errors, to_output)
     sidecar = _sidecar(arrangement, notes, problem, adjustment, uncertainty, noise, to_output, warnings)
     sidecar.statistics.update(
-        _statistics(reconstruction, model, before, errors, counts, problem, noise, solve_seconds, perf_counter() - started)
+        _statistics(
+            reconstruction, model, before, errors, counts, problem, noise, solve_seconds, perf_counter() - started
+        )
     )
     return Refinement(
         reconstruction=model,
@@ -261,7 +274,7 @@ def _relift(arrangement: Arrangement, problem: Problem) -> tuple[Arrangement, Pr
         for j, index in enumerate(arrangement.lens_parameters[c]):
             params[index] += change[c, j]
             largest = max(largest, abs(change[c, j]) / max(abs(params[index]), 1e-3))
-        camera.params = params
+        camera.params = params.tolist()
     observations = lift(arrangement.observations)
     if len(observations.image) != len(problem.tracks.image):
         raise RefractError("the refined intrinsics do not see all keypoints any more: hold the distortion parameters")
@@ -273,10 +286,10 @@ def _relift(arrangement: Arrangement, problem: Problem) -> tuple[Arrangement, Pr
 
 def _raise_unsound(problem: Problem) -> None:
     _, distance = problem.state.planes_in_cam(problem.structure)
-    if np.nanmin(distance) <= 1e-4:
+    if np.nanmin(distance) <= MIN_DISTANCE:
         raise RefractError(
-            "the interface ran into the camera: the data do not show it at a distance; give interface_distance and "
-            "interface_normal with refine_interface_distance off, check the scenario, and use intrinsics from air (camera_path)"
+            "the interface ran into the camera: the data do not show it at a distance; check the scenario, use "
+            "intrinsics from air (camera_path), or hold interface_distance (refine_interface_distance 0)"
         )
     raise RefractError(
         "the interface ran beyond the points, where nothing is refracted: either the scene is dry, or the intrinsics "
@@ -332,7 +345,7 @@ def _write_back(
             pycolmap.Rotation3d(rotation[pose]), translation[pose]
         )
     for camera_id, camera in zip(observations.camera_ids, observations.cameras, strict=True):
-        model.camera(int(camera_id)).params = camera.params
+        model.camera(int(camera_id)).params = list(camera.params)
     kept_points = set(observations.point3D_ids.tolist())
     image_id = observations.image_ids[observations.image]
     kept = set(zip(image_id.tolist(), observations.point2D_idx.tolist(), strict=True))
@@ -368,7 +381,7 @@ def _sidecar(
     layers = problem.layers.with_index(state.index).scaled(scale)
     names = _plane_names(arrangement)
     world_planes = {}
-    for block in np.flatnonzero(structure.plane_in_world):
+    for block in np.flatnonzero(structure.plane_in_world).tolist():
         offset = state.distance[block] + state.normal[block] @ structure.plane_anchor[block]
         normal, offset = to_output.plane(state.normal[block], float(offset))
         world_planes[names[block]] = WorldPlane(normal_in_world=_unit(normal), offset=offset)
@@ -483,5 +496,3 @@ def _unit(vector: Array) -> tuple[float, float, float]:
 
 def _finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
-
-

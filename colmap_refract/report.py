@@ -1,4 +1,4 @@
-"""What was done, in words and numbers for a terminal; everything comes from the sidecar, so it can be said again later."""
+"""What was done, in words and numbers for a terminal; all from the sidecar, so that it can be said again later."""
 
 from __future__ import annotations
 

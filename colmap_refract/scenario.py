@@ -27,7 +27,6 @@ from colmap_refract.interface import Array, tangent_basis
 from colmap_refract.options import Scenario
 from colmap_refract.rotation import cross_matrix, exp_and_left_jacobian
 
-
 SCENARIOS: tuple[Scenario, ...] = get_args(Scenario)
 
 Index = NDArray[np.int64]

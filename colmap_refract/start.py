@@ -1,6 +1,7 @@
-"""Start values of the interfaces from a model that ignored refraction: its poses and points, and a fraction of its depth.
+"""Start values of the interfaces, from the poses and points of a model that ignored refraction.
 
-The minimum does not depend on the fraction within wide bounds; `refinement` tries several where it might.
+A plane starts at a fraction of the depth. The minimum does not depend on it within wide bounds; `continuation` tries
+several where it might.
 """
 
 from __future__ import annotations
@@ -89,7 +90,9 @@ def start_planes(
             normal, offset = world_plane(centers[images], viewing[images], depths[images], ratio)
             if normal_in_cam is not None:
                 normal = rotation[reference].T @ normal_in_cam
-                offset = float(np.median((centers[images] + (ratio * depths[images])[:, None] * viewing[images]) @ normal))
+                offset = float(
+                    np.median((centers[images] + (ratio * depths[images])[:, None] * viewing[images]) @ normal)
+                )
             distance = offset - normal @ structure.plane_anchor[block]
         else:
             normal = np.array([0.0, 0.0, 1.0]) if normal_in_cam is None else normal_in_cam
