@@ -155,10 +155,9 @@ def rmse_over(model: pycolmap.Reconstruction, capture: Capture, reference: pycol
 
 def normal_error(result: Refinement, capture: Capture) -> float:
     """Median over the images, degrees."""
-    cosines = [
-        np.dot(result.sidecar.images[capture.reconstruction.image(image_id).name].normal_in_cam, normal)
-        for image_id, (normal, _) in capture.planes.items()
-    ]
+    images = result.sidecar.images
+    names = {image_id: image.name for image_id, image in capture.reconstruction.images.items()}
+    cosines = [np.array(images[names[i]].normal_in_cam) @ normal for i, (normal, _) in capture.planes.items()]
     return float(np.median(np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))))
 
 

@@ -22,7 +22,7 @@ _OBLIQUE_DEG = 8.0
 
 @dataclass(frozen=True, kw_only=True)
 class Facts:
-    """What is known after a solve: errors and the noise of one coordinate in px, whether the intrinsics are from air."""
+    """What is known after a solve: errors and noise of one coordinate in px, whether the intrinsics are from air."""
 
     arrangement: Arrangement
     problem: Problem

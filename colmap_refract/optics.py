@@ -54,7 +54,9 @@ class Media:
     """
 
     def __init__(self, layers: Layers) -> None:
-        index = np.array([1.0, *layers.index])
+        # A wall without thickness bends nothing, but could be the medium of lowest index.
+        walls = [(h, mu) for h, mu in zip(layers.thickness, layers.index, strict=False) if h > 0]
+        index = np.array([1.0, *(mu for _, mu in walls), layers.refractive_index])
         lowest = int(np.argmin(index))
         self.ratio: Array = index[lowest] / index
         self.ratio_by_index: Array = np.zeros_like(index)
@@ -63,7 +65,7 @@ class Media:
             self.ratio_by_index[:-1] = 1.0 / index[:-1]
         else:
             self.ratio_by_index[-1] = -self.ratio[-1] / index[-1]
-        self.walls: Array = np.array(layers.thickness, dtype=np.float64)
+        self.walls: Array = np.array([h for h, _ in walls], dtype=np.float64)
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", inline="always")
@@ -78,7 +80,7 @@ def snell_root(z, s, distance, ratio, walls):
 
     Returns:
         `(g, h)` with `h` the thickness of the last layer, negative where the point lies before it.
-        `g` is NaN where no ray exists on the continuation (only with a denser camera medium).
+        `g` is NaN where the continuation has no ray: behind a denser camera medium, or inside a thick wall.
     """
     last = ratio.shape[0] - 1
     h = z - distance

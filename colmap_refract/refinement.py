@@ -115,7 +115,7 @@ def refine(
         raise RefractError("the model has no point that two registered images see: there is nothing to refine")
     arrangement = arrange(observations, options, notes)
     counts = _Counts(unusable=model.compute_num_observations() - len(observations.image))
-    num_threads = options.num_threads if options.num_threads > 0 else len(os.sched_getaffinity(0))
+    num_threads = options.num_threads if options.num_threads > 0 else _num_cores()
     settings = SolverSettings(
         num_threads=num_threads,
         max_num_iterations=options.BundleAdjustment.max_num_iterations,
@@ -157,6 +157,13 @@ def refine(
         warnings=tuple(warnings),
         converged=adjustment.termination == "convergence",
     )
+
+
+def _num_cores() -> int:
+    """Cores that this process may use, where the system tells."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _check_model(model: pycolmap.Reconstruction) -> None:

@@ -42,16 +42,16 @@ def point_rmse(reconstruction: pycolmap.Reconstruction, capture: Capture, robust
     source = np.array([reconstruction.points3D[i].xyz for i in common])
     target = np.array([truth.points3D[i].xyz for i in common])
     if not robust:
-        return float(np.sqrt(np.mean(np.sum((_align(source, target, source) - target) ** 2, axis=1))))
+        return float(np.sqrt(np.mean(np.sum((align(source, target, source) - target) ** 2, axis=1))))
     # Runaway points would spoil a first alignment, and they are far from the others.
     error = np.linalg.norm(source - np.median(source, axis=0), axis=1)
     for _ in range(20):
         best = np.argsort(error)[: max(3, int(0.9 * len(error)))]
-        error = np.linalg.norm(_align(source[best], target[best], source) - target, axis=1)
+        error = np.linalg.norm(align(source[best], target[best], source) - target, axis=1)
     return float(np.median(error))
 
 
-def _align(source: Array, target: Array, points: Array) -> Array:
+def align(source: Array, target: Array, points: Array) -> Array:
     """`points` moved by the similarity that brings `source` to `target` (Umeyama 1991)."""
     source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
     u, singular, vt = np.linalg.svd((target - target_mean).T @ (source - source_mean))
