@@ -45,8 +45,8 @@ OUTLIERS = """\
 ## With gross outliers
 
 The same scenes with the same noise, but {percent:.0f} % of the observations replaced by random pixels of their image.
-Fewer good observations are left then, so that the bound itself rises. RMSE is pooled over the seeds; the optimum is
-that of the good observations alone."""
+Fewer good observations are left then, so that the bound itself rises. RMSE is pooled over the seeds, in mm; the optimum
+is that of the good observations alone."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -39,6 +39,9 @@ _LOSSES = {
 _JITTER = 1e-12
 """Of the scaled matrix's unit diagonal: the gauge leaves seven directions without any curvature."""
 
+_FREE_VARIANCE, _PINNED_VARIANCE = 1e6, 1e-6
+"""Squared units of the solve for residuals of one px; keypoints tell a pose to 1e-6 or so."""
+
 MAX_CHUNK_COLUMNS = 700
 """Up to this many unknowns all tracks form one chunk; beyond, Ceres' product of the Jacobian with itself,
 cubic in a chunk's unknowns, is worth splitting for."""
@@ -83,6 +86,9 @@ class Problem:
     held: Held
     loss: Loss = "trivial"
     loss_scale: float = 1.0
+    pinned_pose: int | None = None
+    """Pose block whose distance from the origin stays, so that the size does, which a wall's thickness would
+    otherwise tell, and badly."""
 
     @property
     def optics(self) -> Optics:
@@ -561,6 +567,12 @@ def _solve(
         )  # fmt: skip
     for cost in costs:
         ceres.add_residual_block(cost, None, [blocks.values[key] for key in cost.chunk.keys])
+    if problem.pinned_pose is not None and (POSE, problem.pinned_pose) in blocks.values:
+        ceres.add_residual_block(
+            _size_prior(problem.state.translation[problem.pinned_pose]),
+            None,
+            [blocks.values[POSE, problem.pinned_pose]],
+        )
     for key in blocks.keys:
         if key[0] != PLANE:
             continue
@@ -608,6 +620,14 @@ def _solve(
         gradient_max_norm=watch.gradient_max_norm,
         seconds=float(summary.total_time_in_seconds),
     )
+
+
+def _size_prior(translation: Array) -> Any:
+    """A prior on a pose's change: its shift along its own translation is none, the rest is as good as free."""
+    direction = np.concatenate([np.zeros(3), translation / np.linalg.norm(translation)])
+    covariance = _FREE_VARIANCE * (np.eye(6) - np.outer(direction, direction))
+    covariance += _PINNED_VARIANCE * np.outer(direction, direction)
+    return pyceres.factors.NormalPrior(np.zeros(6), covariance)
 
 
 def _settled(problem: Problem, chunks: list[Chunk], blocks: _Blocks, pool: ThreadPoolExecutor | None) -> Array:

@@ -36,7 +36,7 @@ class Arrangement:
         reference: index of the reference image.
         origin: (3,) model coordinates of the solve's origin.
         unit: model units per unit of the solve.
-        scale_known: whether the model's size is known: its poses are held, or its rig has a baseline.
+        scale_known: whether the model's size is known: poses or points are held, or its rig has a baseline.
         lens_parameters: per camera, the indices of the intrinsic parameters that are refined.
     """
 
@@ -52,16 +52,25 @@ class Arrangement:
     scale_known: bool
     lens_parameters: list[list[int]]
 
-    def layers(self, ratio: float) -> Layers:
-        """The media in units of the solve, for a start at `ratio` of the median depth.
+    def layers(self, distance: float) -> Layers:
+        """The media in units of the solve.
 
         Where the wall's thickness is known in metres but the model's size is not, the reference image's
-        distance (held at `ratio` then) tells how thick the wall is.
+        `distance` (which is held then) tells how thick the wall is.
         """
         options = self.options
         if options.interface_distance is None or self.scale_known:
             return options.layers.scaled(1.0 / self.unit)
-        return options.layers.scaled(ratio / options.interface_distance)
+        return options.layers.scaled(distance / options.interface_distance)
+
+    @property
+    def pinned_pose(self) -> int | None:
+        """The pose block that keeps the size where only a wall would tell it: the one farthest from the reference."""
+        options = self.options
+        if not any(options.layer_thickness) or self.scale_known or options.interface_distance is not None:
+            return None
+        frame = int(np.argmax(np.linalg.norm(self.observations.rig_from_world_translation, axis=1)))
+        return int(self.frame_pose[frame])
 
     @property
     def normal(self) -> Array | None:
@@ -112,14 +121,14 @@ class Arrangement:
             index=options.refractive_index,
             lens=np.zeros((len(observations.cameras), num_lens)),
         )
-        tracks = self.tracks(observations)
         return Problem(
-            tracks=tracks,
+            tracks=self.tracks(observations),
             structure=structure,
-            layers=self.layers(ratio),
+            layers=self.layers(float(state.planes_in_cam(structure)[1][self.reference])),
             state=state,
             points=observations.points,
             held=self.held,
+            pinned_pose=self.pinned_pose,
         )
 
     def tracks(self, observations: Observations) -> Tracks:
@@ -166,7 +175,7 @@ def arrange(observations: Observations, options: RefinerOptions, notes: ImageNot
 
     frame_pose = np.arange(len(observations.frame_ids))
     if scenario == "fixed_camera":
-        observations, frame_pose = _fix_camera(observations, reference)
+        observations, frame_pose = _fix_camera(observations, reference, options.BundleAdjustment.refine_points3D)
     moved, origin, unit = _to_solve_units(observations, reference)
     rotation, translation = moved.cam_from_world
     centers = -np.einsum("nji,nj->ni", rotation, translation)
@@ -184,7 +193,18 @@ def arrange(observations: Observations, options: RefinerOptions, notes: ImageNot
         plane_anchor=anchor,
     )
     adjustment = options.BundleAdjustment
-    scale_known = not adjustment.refine_rig_from_world or bool(np.abs(moved.sensor_translation).max() > 1e-9)
+    poses_known = not adjustment.refine_rig_from_world and scenario != "fixed_camera"
+    rigid = bool(np.abs(moved.sensor_translation).max() > 1e-9)
+    scale_known = poses_known or rigid or not adjustment.refine_points3D
+    if (
+        any(options.layer_thickness)
+        and scenario == "fixed_camera"
+        and options.interface_distance is None
+        and not scale_known
+    ):
+        raise RefractError(
+            "layer_thickness says nothing to a fixed camera, whose model has no size: give interface_distance, too"
+        )
     if scale_known and options.interface_distance is not None and not options.interface_distance < unit:
         raise RefractError(
             f"interface_distance {options.interface_distance:g} lies beyond the points (median depth {unit:g} in "
@@ -271,7 +291,7 @@ def _check_counts(
             )
 
 
-def _fix_camera(observations: Observations, reference: int) -> tuple[Observations, Index]:
+def _fix_camera(observations: Observations, reference: int, move_points: bool) -> tuple[Observations, Index]:
     """One pose per rig: the reference image's, and for further rigs that of their first frame.
 
     Points are put at their depth from that pose along the median direction they are seen in, since poses
@@ -289,6 +309,8 @@ def _fix_camera(observations: Observations, reference: int) -> tuple[Observation
         rig_from_world_rotation=observations.rig_from_world_rotation[keeper[frame_pose]],
         rig_from_world_translation=observations.rig_from_world_translation[keeper[frame_pose]],
     )
+    if not move_points:
+        return fixed, frame_pose
     rotation, translation = fixed.cam_from_world
     image = fixed.image
     centers = -np.einsum("nji,nj->ni", rotation, translation)
@@ -336,13 +358,15 @@ def _held(structure: Structure, options: RefinerOptions, reference: int, scale_k
     poses = np.full(structure.num_poses, not options.BundleAdjustment.refine_rig_from_world)
     normals = np.full(structure.num_planes, not options.refine_interface_normal)
     distances = np.full(structure.num_planes, not options.refine_interface_distance)
-    if options.layers.thickness and options.interface_distance is not None and not scale_known:
+    adjustment = options.BundleAdjustment
+    walls = any(options.layer_thickness) and not scale_known
+    if walls and options.interface_distance is not None:
         # The wall's thickness is known in units of this distance only: it carries the scale.
         distances[structure.image_plane[reference]] = True
-    if options.scenario == "fixed_camera" or normals.any() or distances.any():
+    chosen = options.scenario == "fixed_camera" or normals.any() or distances.any() or walls
+    if chosen and adjustment.refine_points3D:
         # A pose is a choice of the world's frame; a plane held in the world needs one to stand still against.
         poses[structure.image_pose[reference]] = True
-    adjustment = options.BundleAdjustment
     return Held(
         poses=poses,
         normals=normals,

@@ -370,15 +370,19 @@ def _fixed_camera(
     """Equal planes give a fixed camera no parallax, so each point is tied to where it was, less and less."""
     adjusted = None
     for weight in _ANCHORS:
+        held = problem.held
+        if weight > 0:
+            held = replace(held, index=True, lens=True)
         # At first whole images are far off, by their planes' tilt, and no outliers: they must not lose their weight.
         problem = _widened(problem, "huber" if weight >= 1.0 else "cauchy")
         curvature = _curvature(problem)
         if adjusted is None:
             # Tilts first: they are what moves an image as a whole.
-            level = replace(problem, held=replace(problem.held, distances=np.ones_like(problem.held.distances)))
+            level = replace(problem, held=replace(held, distances=np.ones_like(held.distances)))
             adjusted = adjust(level, settings, anchor_weights=weight * curvature, on_progress=on_progress)
             problem = _widened(replace(problem, state=adjusted.state, points=adjusted.points), "huber")
-        adjusted = adjust(problem, settings, anchor_weights=weight * curvature, on_progress=on_progress)
+        freer = replace(problem, held=held)
+        adjusted = adjust(freer, settings, anchor_weights=weight * curvature, on_progress=on_progress)
         if adjusted.termination == "failure":
             return None
         problem = replace(problem, state=adjusted.state, points=adjusted.points)

@@ -209,6 +209,7 @@ def _solve(
     if not start.sound:
         _raise_unsound(start.problem)
     problem = spread_out(arrangement, start, settings)
+    arrangement, problem, _ = _relift(arrangement, problem)
     # The start comes from a few tracks: what it finds wrong by little may be right.
     arrangement, problem, _ = _filter(arrangement, problem, counts, _FIRST_FILTER * options.filter_max_reproj_error)
     noise = estimate_noise(start.problem)
@@ -304,33 +305,34 @@ def _raise_unsound(problem: Problem) -> None:
     )
 
 
+def _stays(arrangement: Arrangement) -> bool:
+    """Whether the world's frame and size are the input's by what is held."""
+    poses_known = bool(arrangement.held.poses.all()) and arrangement.options.scenario != "fixed_camera"
+    return arrangement.held.points or poses_known
+
+
 def _output_frame(arrangement: Arrangement, state: State, points: Array) -> Similarity:
     """From units of the solve to the output: the input's frame and size, or metres."""
     options, observations = arrangement.options, arrangement.observations
     back = Similarity(scale=arrangement.unit, rotation=np.eye(3), translation=arrangement.origin)
-    metric = None
+    if _stays(arrangement):
+        return back
+    # What the size is to be: the input's, by default.
+    scale = 1.0 if arrangement.scale_known else None
     if options.interface_distance is not None and not arrangement.scale_known:
         _, distance = state.planes_in_cam(arrangement.structure)
-        metric = options.interface_distance / (arrangement.unit * float(distance[arrangement.reference]))
-    known = 1.0 if arrangement.scale_known else None
+        scale = options.interface_distance / (arrangement.unit * float(distance[arrangement.reference]))
+    target = observations.cam_from_world
     aligned = None
-    if not arrangement.held.poses.all() or options.scenario == "fixed_camera":
-        source = state.cam_from_world(arrangement.structure)
-        target = observations.cam_from_world
-        if options.scenario != "fixed_camera":
-            aligned = align_poses(source, target, spread=1e-3, scale=metric if metric is not None else known)
-        if aligned is None:
-            # The cameras stand at one place: their distance to the points tells the size.
-            center = -target[0][arrangement.reference].T @ target[1][arrangement.reference]
-            scale = metric if metric is not None else known
-            if scale is None:
-                before = np.median(np.linalg.norm(observations.points - center, axis=1))
-                scale = float(before / np.median(np.linalg.norm(points - center, axis=1)))
-            aligned = rescale_about(center, scale)
-    elif metric is not None:
-        aligned = rescale_about(np.zeros(3), metric)
+    if options.scenario != "fixed_camera":
+        aligned = align_poses(state.cam_from_world(arrangement.structure), target, spread=1e-3, scale=scale)
     if aligned is None:
-        return back
+        # The cameras stand at one place: their distance to the points tells the size.
+        center = -target[0][arrangement.reference].T @ target[1][arrangement.reference]
+        if scale is None:
+            before = np.median(np.linalg.norm(observations.points - center, axis=1))
+            scale = float(before / np.median(np.linalg.norm(points - center, axis=1)))
+        aligned = rescale_about(center, scale)
     return Similarity(
         scale=back.scale * aligned.scale,
         rotation=aligned.rotation,
@@ -346,11 +348,18 @@ def _write_back(
 
     observations, state = arrangement.observations, problem.state
     rotation, translation = to_output.cam_from_world(state.rotation, state.translation)
+    reference = int(observations.image_frame[arrangement.reference])
+    kept = model.frame(int(observations.frame_ids[reference])).rig_from_world
     for f, frame_id in enumerate(observations.frame_ids):
         pose = arrangement.frame_pose[f]
-        model.frame(int(frame_id)).rig_from_world = pycolmap.Rigid3d(
-            pycolmap.Rotation3d(rotation[pose]), translation[pose]
-        )
+        moved = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation[pose]), translation[pose])
+        if arrangement.held.poses[pose]:
+            # What was held comes out to the last digit, where the output's frame is the input's.
+            if _stays(arrangement):
+                continue
+            if arrangement.options.scenario == "fixed_camera" and pose == arrangement.frame_pose[reference]:
+                moved = pycolmap.Rigid3d(kept.rotation, kept.translation)
+        model.frame(int(frame_id)).rig_from_world = moved
     for camera_id, camera in zip(observations.camera_ids, observations.cameras, strict=True):
         model.camera(int(camera_id)).params = list(camera.params)
     kept_points = set(observations.point3D_ids.tolist())
@@ -369,7 +378,8 @@ def _write_back(
     mean_error = np.add.reduceat(errors, observations.start[:-1]) / np.diff(observations.start)
     for point3D_id, xyz, error in zip(observations.point3D_ids.tolist(), points, mean_error, strict=True):
         point = model.point3D(point3D_id)
-        point.xyz = xyz
+        if not arrangement.held.points:
+            point.xyz = xyz
         point.error = float(error)
 
 

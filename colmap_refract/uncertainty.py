@@ -2,7 +2,8 @@
 
 Seven directions (a similarity of the world) change no observation and have no variance of their own; the
 covariance is the one in which the poses as a whole stay in place (inner constraints), or the planes where
-the poses are held. A rig with a baseline, or a wall of known thickness, fixes the scale: then there are six.
+the poses are held. A rig with a baseline fixes the scale: then there are six. (So does a wall of known thickness, in
+principle, but so badly that an adjustment holds the size; it counts as unseen here.)
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ def gauge(problem: Problem, keys: list[Key], columns: dict[Key, int], num_column
                 by[2, 3 + j] = -turned @ anchor
             by[2, 6] += normal @ anchor
         full[PLANE, b] = by
-    scale_fixed = any(h > 0 for h in problem.layers.thickness) or np.abs(structure.sensor_translation).max() > 1e-12
+    scale_fixed = np.abs(structure.sensor_translation).max() > 1e-12
     directions = np.eye(7)[:, : 6 if scale_fixed or problem.held.points else 7]
     # Only combinations that leave all that is held where it is are free.
     held = [by for key, by in full.items() if key not in columns]
