@@ -52,6 +52,8 @@ LARGEST_COST_SPREAD = 1e-3
 """Between starts on the real models, relative."""
 LARGEST_EXCESS = 0.01
 """Of the cost over that at the minimum nearest to the truth, relative: the last few outliers go after the solve."""
+LEAST_OBSERVATIONS_KEPT = 0.99
+"""Of those of a simulated scene, none of which is an outlier."""
 LARGEST_QUIET_RATIO = 2.0
 """Of RMSE to the bound, for a result that comes without any warning."""
 
@@ -332,11 +334,14 @@ def narrow_view(scenario: Scenario, noise: float, line: ProgressLine, findings: 
         except RefractError as error:
             findings.missed.append(f"{where}: what was kept cannot be refined again: {error}")
         findings.rows.append([
-            *head, f"{accuracy:.3f}", f"{100 * kept:.1f}", f"{solver['cost']:.5g}", f"{at_truth:.5g}",
+            *head, f"{accuracy:.3f}", f"{100 * kept:.1f}", f"{solver['cost']:.5g}",
+            f"{at_truth:.5g}" if math.isfinite(at_truth) else "-",
             f"{distance:.3f}", f"{deviation:.3g}", f"{spread:.3f}", str(solver["num_iterations"]),
             str(len(result.warnings)), "yes" if result.converged else "no",
         ])  # fmt: skip
         told += [f"- {where}: {sentence}" for sentence in result.warnings]
+        if kept < LEAST_OBSERVATIONS_KEPT:
+            findings.missed.append(f"{where}: {100 * kept:.1f} % of the observations kept, though none is an outlier")
         if solver["cost"] > (1.0 + LARGEST_EXCESS) * at_truth:
             findings.missed.append(f"{where}: the cost is {solver['cost']:.5g}, at the truth {at_truth:.5g}")
         if not result.converged:

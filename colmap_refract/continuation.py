@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_refract import elimination
 from colmap_refract.adjustment import (
@@ -48,7 +49,13 @@ _OPEN_RATIOS = (0.5, 0.15)
 _HOUSING_RATIOS = (0.02, 0.2)
 _PLAUSIBLE_NOISE = 1.0
 """Pixels, of a keypoint's coordinate: larger residuals let one try another start."""
+_NARROW_VIEW_DEG = 20.0
+_CLEARLY_LESS = 0.9
 _MAX_TURNS = 3
+_MAX_RELABELS = 6
+_NEGLIGIBLE_PART = 1e-3
+_CLEARLY = 5.0
+"""Times the noise: how much better a point must fit to be taken to be dry."""
 MIN_DISTANCE = 1e-4
 """Of the median depth: a plane nearer than this has run into the camera."""
 MIN_WET = 0.05
@@ -91,6 +98,7 @@ def find_start(arrangement: Arrangement, settings: SolverSettings, watch: Watch 
     for ratio in ratios:
         start = _try(arrangement, arrangement.start(ratio, few), ratio, settings, watch)
         if start is not None:
+            start = _ashore(start, _through(settings), named(watch, "Dry points"))
             starts.append(start)
             logger.debug("start at %.3g of the depth: cost %.6g, sound %s", ratio, start.cost, start.sound)
             if start.sound and estimate_noise(start.problem) < _PLAUSIBLE_NOISE:
@@ -105,19 +113,36 @@ def _try(
 ) -> Start | None:
     """Follow one start distance to its minimum: planes held, then free; None where no way was found."""
     on_progress = named(watch, f"Start at {ratio:.3g} of the depth")
-    settings = replace(settings, max_num_iterations=min(60, settings.max_num_iterations), function_tolerance=1e-6)
+    settings = _through(settings)
     if arrangement.options.scenario == "fixed_camera":
         return _fixed_camera(problem, ratio, settings, on_progress)
     if arrangement.options.scenario == "moving_interface":
-        common = _from_common_plane(arrangement, problem, ratio, settings, on_progress)
-        if common is not None:
-            return _let_loose(common, ratio, settings, on_progress)
+        common = _from_common_plane(arrangement, problem, ratio, True, settings, on_progress)
+        start = None if common is None else _let_loose(common, ratio, settings, on_progress)
+        if _view_deg(problem) < _NARROW_VIEW_DEG:
+            # A common plane may come out far from the moving ones: from where it stood at first, too.
+            common = _from_common_plane(arrangement, problem, ratio, False, settings, on_progress)
+            other = None if common is None else _let_loose(common, ratio, settings, on_progress)
+            better = other is not None and other.sound and (start is None or other.cost < _CLEARLY_LESS * start.cost)
+            start = other if better else start
+        if start is not None:
+            return start
     elif not _stands(problem):
         unbent = _unbend(problem, ratio, settings, on_progress)
         if unbent is None:
             return None
         problem = unbent
     return _settle_and_free(problem, ratio, settings, on_progress)
+
+
+def _through(settings: SolverSettings) -> SolverSettings:
+    """As far as a start has to be carried."""
+    return replace(settings, max_num_iterations=min(60, settings.max_num_iterations), function_tolerance=1e-6)
+
+
+def _view_deg(problem: Problem) -> float:
+    """Full angle of the view that the keypoints fill, by and large, degrees."""
+    return 2.0 * float(np.degrees(np.arccos(np.clip(np.quantile(problem.tracks.direction[:, 2], 0.05), -1.0, 1.0))))
 
 
 def _settle_and_free(
@@ -144,6 +169,7 @@ def _from_common_plane(
     arrangement: Arrangement,
     problem: Problem,
     ratio: float,
+    tilting: bool,
     settings: SolverSettings,
     on_progress: Callable[[Progress], None] | None,
 ) -> Problem | None:
@@ -161,7 +187,7 @@ def _from_common_plane(
         plane_anchor=np.zeros((1, 3)),
     )
     normal, distance = start_planes(arrangement.observations, common, ratio, arrangement.normal, arrangement.reference)
-    free = np.zeros(1, dtype=np.bool_)
+    free = np.array([not tilting])
     tied = replace(
         problem,
         structure=common,
@@ -228,13 +254,47 @@ def _turned_over(
             return None
         mirrored = _mirrored(best.problem)
         if mirrored is None:
-            return best
+            break
         mirrored = _widened(retriangulate(mirrored))
         turned = _start(mirrored, ratio, adjust(mirrored, settings, on_progress=on_progress))
-        if turned is None or _wide_cost(turned.problem) >= _wide_cost(best.problem):
-            return best
+        if turned is None or turned.cost >= best.cost:
+            break
         best = turned
     return best
+
+
+def _ashore(start: Start, settings: SolverSettings, on_progress: Callable[[Progress], None] | None) -> Start:
+    """The start with the points that are better seen straight taken to be dry, and solved again until that settles.
+
+    A plane that was found with dry points among the wet ones stands in the wrong place to tell them apart, so
+    at first the fit decides, not the side.
+    """
+    problem = start.problem
+    if label_wet(problem)[problem.tracks.wet].all():
+        return start
+    for _ in range(_MAX_RELABELS):
+        wet = wet_by_fit(problem)
+        if (wet != problem.tracks.wet).mean() <= _NEGLIGIBLE_PART or not wet.any():
+            break
+        problem = _widened(retriangulate(replace(problem, tracks=problem.tracks._replace(wet=wet))))
+        adjusted = adjust(problem, settings, on_progress=on_progress)
+        if adjusted.termination == "failure":
+            return start
+        problem = replace(problem, state=adjusted.state, points=adjusted.points)
+    return replace(start, problem=problem, cost=_wide_cost(problem), sound=is_sound(problem))
+
+
+def wet_by_fit(problem: Problem) -> NDArray[np.bool_]:
+    """Which observations (N,) are of points that do not fit clearly better straight than through the interface."""
+    refracted = problem.structure.image_plane[problem.tracks.image] >= 0
+    costs = []
+    for wet in (refracted, np.zeros_like(refracted)):
+        trial = retriangulate(replace(problem, tracks=problem.tracks._replace(wet=wet)))
+        trial = replace(trial, points=settle_points(trial, SolverSettings()))
+        costs.append(_point_costs(trial))
+    # Where both fit, as in a narrow view, noise must not decide.
+    clearly_dry = costs[0] - costs[1] > (_CLEARLY * estimate_noise(problem)) ** 2
+    return np.asarray(refracted & np.repeat(~clearly_dry, np.diff(problem.tracks.start)))
 
 
 def _mirrored(problem: Problem) -> Problem | None:

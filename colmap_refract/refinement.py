@@ -10,6 +10,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_refract.adjustment import Adjustment, Problem, SolverSettings, adjust, settle_points
 from colmap_refract.advice import Facts, advise
@@ -24,6 +25,7 @@ from colmap_refract.continuation import (
     named,
     retriangulate,
     spread_out,
+    wet_by_fit,
 )
 from colmap_refract.errors import RefractError
 from colmap_refract.filtering import filter_observations, label_wet, pinhole_errors, reprojection_errors
@@ -211,7 +213,11 @@ def _solve(
     problem = spread_out(arrangement, start, settings)
     arrangement, problem, _ = _relift(arrangement, problem)
     # The start comes from a few tracks: what it finds wrong by little may be right.
-    arrangement, problem, _ = _filter(arrangement, problem, counts, _FIRST_FILTER * options.filter_max_reproj_error)
+    # Nor does it tell a point's side of the plane yet: only what is clearly better seen straight is dry.
+    limit = _FIRST_FILTER * options.filter_max_reproj_error
+    outlying = (reprojection_errors(problem, arrangement.observations) > limit).mean() if limit > 0 else 1.0
+    wet = wet_by_fit(problem) if outlying > _NEGLIGIBLE_CHANGE else problem.tracks.wet
+    arrangement, problem, _ = _filter(arrangement, problem, wet, settings, counts, limit)
     noise = estimate_noise(start.problem)
     for round_ in range(_NUM_FILTER_ROUNDS + 1):
         stage = "Refractive bundle adjustment" + (f", filtered {round_ + 1} times" if round_ else "")
@@ -219,7 +225,9 @@ def _solve(
         adjustment = adjust(problem, settings, on_progress=named(watch, stage))
         problem = replace(problem, state=adjustment.state, points=adjustment.points)
         arrangement, problem, moved = _relift(arrangement, problem)
-        arrangement, problem, changed = _filter(arrangement, problem, counts, options.filter_max_reproj_error)
+        arrangement, problem, changed = _filter(
+            arrangement, problem, label_wet(problem), settings, counts, options.filter_max_reproj_error
+        )
         if not moved and changed <= _NEGLIGIBLE_CHANGE:
             break
         noise = estimate_noise(problem)
@@ -240,13 +248,19 @@ def _with_loss(arrangement: Arrangement, problem: Problem, noise: float) -> Prob
 
 
 def _filter(
-    arrangement: Arrangement, problem: Problem, counts: _Counts, limit: float
+    arrangement: Arrangement,
+    problem: Problem,
+    wet: NDArray[np.bool_],
+    settings: SolverSettings,
+    counts: _Counts,
+    limit: float,
 ) -> tuple[Arrangement, Problem, float]:
     """Label wet and dry anew, remove outliers over `limit` px, count them; and the part of all that this changed."""
-    wet = label_wet(problem)
     relabelled = float((wet != problem.tracks.wet).mean())
     if relabelled > 0:
+        # A point that changes sides has to move before its errors mean anything.
         problem = retriangulate(replace(problem, tracks=problem.tracks._replace(wet=wet)))
+        problem = replace(problem, points=settle_points(problem, settings))
     marks = filter_observations(
         problem,
         arrangement.observations,

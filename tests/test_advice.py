@@ -91,8 +91,8 @@ def test_uncertain_planes(
 @pytest.mark.parametrize(
     ("scenario", "scene_options"),
     [
-        ("static_interface", {"focal_length": 11440.0}),
-        ("camera_housing", {"tilt_deg": 0.0, "focal_length": 2500.0, "num_points": 40}),
+        ("static_interface", {"oblique_deg": 0.0}),
+        ("camera_housing", {"focal_length": 5000.0, "num_points": 60}),
     ],
 )
 def test_index_that_cannot_be_told(scenes: Scenes, scenario: Scenario, scene_options: dict[str, Any]) -> None:

@@ -256,7 +256,7 @@ def test_held_pose_of_a_fixed_camera_says_nothing_of_the_size(scenes: Scenes) ->
     scene = scenes("fixed_camera")
     held = scene.refine(BundleAdjustment=BundleAdjustmentOptions(refine_rig_from_world=False))
     free = scene.refined
-    np.testing.assert_array_equal(poses(held.reconstruction), poses(scene.model))
+    np.testing.assert_allclose(poses(held.reconstruction), poses(scene.model), atol=1e-14)
     # The pose is held in any case, so nothing else may differ.
     np.testing.assert_allclose(
         position_array(held.reconstruction), position_array(free.reconstruction), rtol=0, atol=0.05 * scene.bound
@@ -393,19 +393,25 @@ def test_refractive_index_of_a_fixed_camera(scenes: Scenes) -> None:
     ],
 )
 def test_intrinsics(scenes: Scenes, scenario: Scenario, free: str, wrong: tuple[float, ...]) -> None:
+    """The minimum is one of the pixels' errors, so that it cannot be higher than with the true intrinsics held.
+
+    Linearised at noisy keypoints, which is nearly as good for each, the focal length comes out some px too long.
+    """
     scene = scenes(scenario, oblique_deg=30.0)
     model = scene.copy()
     truth = scene.capture.reconstruction.camera(1).params
     model.camera(1).params = truth + wrong
-    options = BundleAdjustmentOptions(**{free: True})
-    result = scene.refine(model, BundleAdjustment=options)
+    # The scale of the loss is given, so that costs can be compared.
+    at_truth = scene.refine(BundleAdjustment=BundleAdjustmentOptions(loss_function_scale=2.0))
+    result = scene.refine(model, BundleAdjustment=BundleAdjustmentOptions(**{free: True}, loss_function_scale=2.0))
     found = result.reconstruction.camera(1).params
     off = np.array(wrong) != 0
-    # The focal length is the one that refraction hides best: a few px are within its standard deviation.
-    assert (np.abs(found - truth)[off] < np.array([12.0, 2.0, 2.0, 0.004])[off]).all()
+    # A few standard deviations of captures of this size.
+    assert (np.abs(found - truth)[off] < np.array([6.0, 1.5, 1.5, 0.004])[off]).all()
     np.testing.assert_array_equal(found[~off], truth[~off])
-    assert result.reconstruction.num_points3D() == model.num_points3D()
-    assert scene.excess(result.reconstruction) < 1.6
+    assert point_contents(result.reconstruction) == point_contents(model)
+    assert result.sidecar.solver["cost"] < at_truth.sidecar.solver["cost"] * (1 + 1e-6)
+    assert scene.excess(result.reconstruction) < 1.3 * NEAR_BOUND
     assert_errors_are_refractive(result)
 
 
