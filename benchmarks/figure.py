@@ -61,7 +61,9 @@ def main() -> None:
             f'<text x="{_MARGIN + 20 + 330 * k}" y="{_HEIGHT - 8}" fill="{_COLORS[name]}">'
             f"&#9679; {name}: {rmse:.1f} mm rms</text>"
         )
-    parts.append(f'<text x="{_WIDTH - 20}" y="{_HEIGHT - 8}" text-anchor="end">height error [mm] across the pool</text>')
+    parts.append(
+        f'<text x="{_WIDTH - 20}" y="{_HEIGHT - 8}" text-anchor="end">height error [mm] across the pool</text>'
+    )
     path = Path(__file__).parent / "results" / "figure.svg"
     path.parent.mkdir(exist_ok=True)
     path.write_text("".join(parts) + "</svg>\n", encoding="utf-8")

@@ -159,7 +159,9 @@ def main() -> None:
     print(text)
     results = Path(__file__).parent / "results"
     results.mkdir(exist_ok=True)
-    command = f"python benchmarks/speed.py --images {' '.join(map(str, arguments.images))} --threads {arguments.threads}"
+    command = (
+        f"python benchmarks/speed.py --images {' '.join(map(str, arguments.images))} --threads {arguments.threads}"
+    )
     (results / "speed.md").write_text(f"`{command} --repeats {arguments.repeats}`\n\n{text}\n", encoding="utf-8")
 
 

@@ -105,7 +105,7 @@ def _optics(layers: Layers, index: float) -> Optics:
 class SolverSettings:
     """How Ceres is run. Tolerances are relative."""
 
-    max_num_iterations: int = 100
+    max_num_iterations: int = 300
     function_tolerance: float = 1e-9
     gradient_tolerance: float = 1e-12
     parameter_tolerance: float = 1e-10

@@ -16,6 +16,8 @@ _NORMAL_LIMIT_DEG = 2.0
 _DISTANCE_LIMIT = 0.1
 _CORRELATION_LIMIT = 0.95
 _DECREMENT_LIMIT = 1e-4
+_STUCK = 1e-2
+"""Of the cost: with as much still to be gained, a solver that takes no more steps is stuck."""
 _NARROW_VIEW_DEG = 20.0
 _OBLIQUE_DEG = 8.0
 
@@ -34,9 +36,14 @@ class Facts:
     errors: Array
 
 
+def has_converged(adjustment: Adjustment, uncertainty: Uncertainty) -> bool:
+    """Whether the solver stopped where there is a minimum, and not only because its steps had become small."""
+    return adjustment.termination == "convergence" and uncertainty.decrement <= _STUCK
+
+
 def advise(facts: Facts) -> list[str]:
     """Sentences for the user, the gravest first; none where all is well."""
-    return [*_solver(facts), *_intrinsics(facts), *_planes(facts), *_index(facts), *_water(facts)]
+    return [*_solver(facts), *_images(facts), *_intrinsics(facts), *_planes(facts), *_index(facts), *_water(facts)]
 
 
 def _solver(facts: Facts) -> list[str]:
@@ -46,12 +53,30 @@ def _solver(facts: Facts) -> list[str]:
             f"The solver did not converge ({adjustment.message.strip()}): do not trust the result; allow more "
             "--BundleAdjustment.max_num_iterations."
         ]
+    if facts.uncertainty.decrement > _STUCK:
+        return [
+            f"The solver is stuck: {100 * facts.uncertainty.decrement:.2g} % of the cost could still be gained, so do not "
+            "trust the result; try another --initial_distance_ratio, or hold what is known of the interface."
+        ]
     if facts.uncertainty.decrement > _DECREMENT_LIMIT:
         return [
             f"The solver stopped although {100 * facts.uncertainty.decrement:.2g} % of the cost could still be gained: "
             "lower --BundleAdjustment.function_tolerance."
         ]
     return []
+
+
+def _images(facts: Facts) -> list[str]:
+    """Images that the filter left without anything."""
+    observations = facts.arrangement.observations
+    counts = np.bincount(observations.image, minlength=len(observations.image_ids))
+    lost = [observations.image_names[i] for i in np.flatnonzero(counts == 0)]
+    if not lost:
+        return []
+    return [
+        f"{len(lost)} images have lost all their observations (such as '{lost[0]}'): their poses and interfaces mean "
+        "nothing; leave them out of the model, or check --scenario."
+    ]
 
 
 def _intrinsics(facts: Facts) -> list[str]:

@@ -33,7 +33,7 @@ class BundleAdjustmentOptions:
     """Robust loss on the reprojection errors."""
     loss_function_scale: float | None = None
     """Scale of the loss, px. By default four times the noise that the residuals show."""
-    max_num_iterations: int = 100
+    max_num_iterations: int = 300
     """Of the solver, each time it runs."""
     function_tolerance: float = 1e-9
     """Relative change of the cost at which the solver stops."""

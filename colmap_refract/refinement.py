@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_refract.adjustment import Adjustment, Problem, SolverSettings, adjust, settle_points
-from colmap_refract.advice import Facts, advise
+from colmap_refract.advice import Facts, advise, has_converged
 from colmap_refract.alignment import Similarity, align_poses, rescale_about
 from colmap_refract.arrangement import Arrangement, arrange
 from colmap_refract.continuation import (
@@ -157,7 +157,7 @@ def refine(
         reconstruction=model,
         sidecar=sidecar,
         warnings=tuple(warnings),
-        converged=adjustment.termination == "convergence",
+        converged=has_converged(adjustment, uncertainty),
     )
 
 
@@ -453,7 +453,7 @@ def _sidecar(
         options=options,
         solver={
             "termination": adjustment.termination,
-            "converged": adjustment.termination == "convergence",
+            "converged": has_converged(adjustment, uncertainty),
             "message": adjustment.message,
             "num_iterations": adjustment.num_iterations,
             "cost": adjustment.cost,

@@ -73,9 +73,7 @@ def scenes() -> Scenes:
 
 def centers_of(reconstruction: pycolmap.Reconstruction) -> Array:
     """Projection centres (I, 3), images by id."""
-    return np.array(
-        [image.projection_center() for _, image in sorted(reconstruction.images.items()) if image.has_pose]
-    )
+    return np.array([image.projection_center() for _, image in sorted(reconstruction.images.items()) if image.has_pose])
 
 
 @pytest.fixture(scope="session")

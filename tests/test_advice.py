@@ -23,9 +23,7 @@ def test_good_scene_needs_no_advice(scenes: Scenes, scenario: Scenario) -> None:
 
 @pytest.mark.parametrize("scenario", ["static_interface", "moving_interface"])
 @pytest.mark.parametrize("camera_model", ["SIMPLE_RADIAL", "OPENCV", "SIMPLE_PINHOLE", "OPENCV_FISHEYE"])
-def test_intrinsics_refined_under_water_are_called_out(
-    scenes: Scenes, scenario: Scenario, camera_model: str
-) -> None:
+def test_intrinsics_refined_under_water_are_called_out(scenes: Scenes, scenario: Scenario, camera_model: str) -> None:
     """They have absorbed a part of the refraction, which shows in no residual."""
     scene = scenes(scenario, camera_model=camera_model)
     model = ignore_refraction(scene.capture, refine_intrinsics=True)

@@ -32,9 +32,7 @@ TIMEOUT = 120
 
 def snapshot(folder: Path) -> dict[str, bytes]:
     """Every file and folder below `folder`, hidden ones included."""
-    return {
-        str(p.relative_to(folder)): p.read_bytes() if p.is_file() else b"folder" for p in sorted(folder.rglob("*"))
-    }
+    return {str(p.relative_to(folder)): p.read_bytes() if p.is_file() else b"folder" for p in sorted(folder.rglob("*"))}
 
 
 @pytest.fixture(scope="session")
@@ -145,7 +143,8 @@ def test_options_arrive(run: Run, model: Path, tmp_path: Path) -> None:
     run(
         refiner(
             model, tmp_path / "out",
-            "--refractive_index", "1.34", "--layer_thickness", "0.01", "0.02", "--layer_refractive_index", "1.52", "1.49",
+            "--refractive_index", "1.34",
+            "--layer_thickness", "0.01", "0.02", "--layer_refractive_index", "1.52", "1.49",
             "--interface_distance", "1.1", "--interface_normal", "0", "0.1", "1", "--refine_interface_normal", "0",
             "--reference_image", "frame_0002.jpg", "--filter_max_reproj_error", "5", "--filter_min_tri_angle", "1",
             "--BundleAdjustment.loss_function_type", "huber", "--BundleAdjustment.loss_function_scale", "1.5",
@@ -273,25 +272,24 @@ def test_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    "arguments",
+    "line",
     [
-        [],
-        ["refine"],
-        ["refiner"],
-        ["refiner", "--input_path", "a", "--output_path", "b"],
-        ["refiner", "--input_path", "a", "--output_path", "b", "--scenario", "aquarium"],
-        ["refiner", "--input_path", "a", "--output_path", "b", "--scenario", "camera_housing", "--index", "1.3"],
-        ["refiner", "--input_path", "a", "--output_path", "b", "--scenario", "camera_housing", "--overwrite", "2"],
-        ["refiner", "--input_path", "a", "--output_path", "b", "--scenario", "camera_housing", "--overwrite"],
-        ["refiner", "--input_path", "a", "--output_path", "b", "--scenario", "camera_housing", "--num_threads", "two"],
-        ["refiner", "--input_path", "a", "--output_path", "b", "--scenario", "camera_housing", "--interface_normal", "1"],
-        ["model_analyzer"],
+        "",
+        "refine",
+        "refiner",
+        "refiner --input_path a --output_path b",
+        "refiner --input_path a --output_path b --scenario aquarium",
+        "refiner --input_path a --output_path b --scenario camera_housing --index 1.3",
+        "refiner --input_path a --output_path b --scenario camera_housing --overwrite 2",
+        "refiner --input_path a --output_path b --scenario camera_housing --overwrite",
+        "refiner --input_path a --output_path b --scenario camera_housing --num_threads two",
+        "refiner --input_path a --output_path b --scenario camera_housing --interface_normal 1",
+        "model_analyzer",
     ],
-    ids=lambda arguments: " ".join(arguments) or "nothing",
-)  # fmt: skip
-def test_wrong_command_line(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+)
+def test_wrong_command_line(line: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
-        main(arguments)
+        main(line.split())
     assert caught.value.code == 2
     assert "Traceback" not in capsys.readouterr().err
 
@@ -417,11 +415,10 @@ def test_impossible_options(
 
 @pytest.mark.parametrize("option", ["--interface_group_path", "--dry_image_list_path"])
 @pytest.mark.parametrize(
-    ("content", "said"), [(b"nobody.jpg x\n", "nobody.jpg"), (b"\xff\xfe\x00", "cannot be read"), (None, "cannot be read")]
-)  # fmt: skip
-def test_lists_of_images(
-    run: Run, model: Path, tmp_path: Path, option: str, content: bytes | None, said: str
-) -> None:
+    ("content", "said"),
+    [(b"nobody.jpg x\n", "nobody.jpg"), (b"\xff\xfe\x00", "cannot be read"), (None, "cannot be read")],
+)
+def test_lists_of_images(run: Run, model: Path, tmp_path: Path, option: str, content: bytes | None, said: str) -> None:
     listed = tmp_path / "list.txt"
     if content is not None:
         listed.write_bytes(content)
@@ -429,8 +426,9 @@ def test_lists_of_images(
 
 
 @pytest.mark.parametrize(
-    ("lines", "said"), [("frame_0001.jpg a\nframe_0001.jpg b\n", "two groups"), ("frame_0001.jpg\n", "IMAGE_NAME GROUP")]
-)  # fmt: skip
+    ("lines", "said"),
+    [("frame_0001.jpg a\nframe_0001.jpg b\n", "two groups"), ("frame_0001.jpg\n", "IMAGE_NAME GROUP")],
+)
 def test_groups_that_say_two_things(run: Run, model: Path, tmp_path: Path, lines: str, said: str) -> None:
     (tmp_path / "list.txt").write_text(lines)
     arguments = refiner(model, tmp_path / "out", "--interface_group_path", str(tmp_path / "list.txt"))

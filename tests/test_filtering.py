@@ -104,9 +104,7 @@ def test_large_errors_are_marked(scenes: Scenes) -> None:
     assert filtered.num_small_angle == 0
     outlier = [
         (int(image), int(idx)) in scene.capture.outliers
-        for image, idx in zip(
-            observations.image_ids[observations.image], observations.point2D_idx, strict=True
-        )
+        for image, idx in zip(observations.image_ids[observations.image], observations.point2D_idx, strict=True)
     ]
     assert (removed & ~np.array(outlier)).sum() == 0
     everything = filter_observations(problem, observations, max_reproj_error=0.0, min_tri_angle=0.0)
@@ -125,9 +123,7 @@ def test_small_angles_are_marked(scenes: Scenes) -> None:
     np.testing.assert_array_equal(filtered.keep, ~small[observations.point])
     assert filtered.num_large_error == 0
     both = filter_observations(problem, observations, max_reproj_error=1.0, min_tri_angle=limit)
-    np.testing.assert_array_equal(
-        both.keep, filtered.keep & ~(reprojection_errors(problem, observations) > 1.0)
-    )
+    np.testing.assert_array_equal(both.keep, filtered.keep & ~(reprojection_errors(problem, observations) > 1.0))
 
 
 @pytest.mark.parametrize("scenario", ["moving_interface", "fixed_camera"])

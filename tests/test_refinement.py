@@ -177,9 +177,7 @@ def test_outliers_do_little_harm(scenes: Scenes, scenario: Scenario) -> None:
         for element in point.track.elements
     }
     everything = {
-        (element.image_id, element.point2D_idx)
-        for point in model.points3D.values()
-        for element in point.track.elements
+        (element.image_id, element.point2D_idx) for point in model.points3D.values() for element in point.track.elements
     }
     assert len(capture.outliers) > 200
     # One random pixel in a few ten thousand is near the right one.
@@ -287,9 +285,7 @@ def test_held_normal(scenes: Scenes, scenario: Scenario) -> None:
     scene = scenes(scenario)
     name = scene.model.image(3).name
     normal = scene.capture.planes[3][0]
-    result = scene.refine(
-        interface_normal=tuple(2.5 * normal), refine_interface_normal=False, reference_image=name
-    )
+    result = scene.refine(interface_normal=tuple(2.5 * normal), refine_interface_normal=False, reference_image=name)
     held = result.sidecar.images[name]
     np.testing.assert_allclose(held.normal_in_cam, normal, rtol=0, atol=1e-15)
     assert held.normal_std_deg is None
@@ -462,7 +458,7 @@ def test_wall_with_known_distance(scenes: Scenes, scenario: Scenario) -> None:
     assert_errors_are_refractive(result)
 
 
-@pytest.mark.parametrize("scenario", SCENARIOS)
+@pytest.mark.parametrize("scenario", MOVING_CAMERA)
 def test_wall_in_units_of_the_model(scenes: Scenes, scenario: Scenario) -> None:
     """Without a distance the model keeps its size, and so does the wall: three per cent are the bending."""
     scene = scenes(scenario, layers=WALL, distance_ratio=0.1 if scenario == "camera_housing" else None)
@@ -473,6 +469,12 @@ def test_wall_in_units_of_the_model(scenes: Scenes, scenario: Scenario) -> None:
     assert scene.excess(result.reconstruction) < NEAR_BOUND
     assert result.sidecar.layers.thickness == pytest.approx((0.5,), rel=0.03)
     assert_errors_are_refractive(result)
+
+
+def test_wall_of_a_fixed_camera_needs_a_distance(scenes: Scenes) -> None:
+    """Its model has the depth that somebody made up, which is no size to give a thickness in."""
+    with pytest.raises(RefractError, match="interface_distance"):
+        scenes("fixed_camera").refine(layer_thickness=(0.05,), layer_refractive_index=(1.52,))
 
 
 # --- Who shares what -------------------------------------------------------------------------------------------------
@@ -795,9 +797,7 @@ def test_result_moves_with_the_input(scenes: Scenes, scenario: Scenario) -> None
     expected.transform(move)
     # 5e4 units have eleven digits behind the noise bound's, of which the solver needs some.
     tolerance = 1e-3 * 300.0 * scene.bound
-    np.testing.assert_allclose(
-        position_array(moved.reconstruction), position_array(expected), rtol=0, atol=tolerance
-    )
+    np.testing.assert_allclose(position_array(moved.reconstruction), position_array(expected), rtol=0, atol=tolerance)
     np.testing.assert_allclose(centers(moved.reconstruction), centers(expected), rtol=0, atol=tolerance)
     np.testing.assert_allclose(planes(moved)[1], 300.0 * planes(scene.refined)[1], rtol=1e-5)
     np.testing.assert_allclose(planes(moved)[0], planes(scene.refined)[0], atol=1e-6)

@@ -124,8 +124,13 @@ HOLD_POINTS = BundleAdjustmentOptions(refine_points3D=False)
         ("moving_interface", {"sensors_per_frame": 2}, {}, 6),
         ("static_interface", {"sensors_per_frame": 2}, {}, 6),
         ("camera_housing", {"sensors_per_frame": 2}, {}, 6),
-        # A wall of known thickness tells the size.
-        ("static_interface", {}, {"layer_thickness": (0.1,), "layer_refractive_index": (1.5,)}, 6),
+        # A wall in metres and a distance in metres: the distance carries the size.
+        (
+            "static_interface",
+            {},
+            {"layer_thickness": (0.1,), "layer_refractive_index": (1.5,), "interface_distance": 1.0},
+            0,
+        ),
         ("moving_interface", {}, {"refine_refractive_index": True}, 7),
         ("moving_interface", {}, {"BundleAdjustment": HOLD_POSES}, 0),
         ("static_interface", {}, {"BundleAdjustment": HOLD_POSES}, 0),
