@@ -3,9 +3,9 @@
     python benchmarks/speed.py [--images 100 500] [--threads 2] [--repeats 3]
 
 COLMAP is timed twice: on the very keypoints (which refraction bends away from its model, as a user would
-run it) and on the keypoints of the same scene without water, which its model fits and where it converges at its best. Ours
-includes everything from finding the start to the last solve after filtering. Peak memory is measured in a
-process of its own each.
+run it) and on the keypoints of the same scene without water, which its model fits and where it converges at its
+best. Ours includes everything from finding the start to the last solve after filtering. Peak memory is measured in
+a process of its own each.
 """
 
 from __future__ import annotations

@@ -55,8 +55,8 @@ def _solver(facts: Facts) -> list[str]:
         ]
     if facts.uncertainty.decrement > _STUCK:
         return [
-            f"The solver is stuck: {100 * facts.uncertainty.decrement:.2g} % of the cost could still be gained, so do not "
-            "trust the result; try another --initial_distance_ratio, or hold what is known of the interface."
+            f"The solver is stuck: {100 * facts.uncertainty.decrement:.2g} % of the cost could still be gained, so do "
+            "not trust the result; try another --initial_distance_ratio, or hold what is known of the interface."
         ]
     if facts.uncertainty.decrement > _DECREMENT_LIMIT:
         return [

@@ -363,7 +363,7 @@ def _write_back(
     observations, state = arrangement.observations, problem.state
     rotation, translation = to_output.cam_from_world(state.rotation, state.translation)
     reference = int(observations.image_frame[arrangement.reference])
-    kept = model.frame(int(observations.frame_ids[reference])).rig_from_world
+    original = model.frame(int(observations.frame_ids[reference])).rig_from_world
     for f, frame_id in enumerate(observations.frame_ids):
         pose = arrangement.frame_pose[f]
         moved = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation[pose]), translation[pose])
@@ -372,7 +372,7 @@ def _write_back(
             if _stays(arrangement):
                 continue
             if arrangement.options.scenario == "fixed_camera" and pose == arrangement.frame_pose[reference]:
-                moved = pycolmap.Rigid3d(kept.rotation, kept.translation)
+                moved = pycolmap.Rigid3d(original.rotation, original.translation)
         model.frame(int(frame_id)).rig_from_world = moved
     for camera_id, camera in zip(observations.camera_ids, observations.cameras, strict=True):
         model.camera(int(camera_id)).params = list(camera.params)
