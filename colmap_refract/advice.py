@@ -94,7 +94,8 @@ def _intrinsics(facts: Facts) -> list[str]:
         extra = [camera.params[i] for i in camera.extra_params_idxs()]
         focal = camera.mean_focal_length()
         # COLMAP refines focal length and distortion and leaves the principal point in the middle.
-        if centered and any(abs(p) > 1e-9 for p in extra) and abs(focal - round(focal)) > 1e-6:
+        refined = not extra or any(abs(p) > 1e-9 for p in extra)
+        if centered and refined and abs(focal - round(focal)) > 1e-6:
             suspicious.append(str(camera_id))
     if suspicious:
         sentences.append(

@@ -131,8 +131,14 @@ class Arrangement:
             pinned_pose=self.pinned_pose,
         )
 
-    def tracks(self, observations: Observations) -> Tracks:
-        """The kernel's view of observations, all of images with an interface taken to be wet."""
+    def tracks(self, observations: Observations, predicted: Array | None = None) -> Tracks:
+        """The kernel's view of observations, all of images with an interface taken to be wet.
+
+        Args:
+            predicted: (N, 3) directions at which a change of the intrinsics is judged; the keypoints' own by
+                default. Theirs carry the noise, which then looks like a trend of the focal length.
+        """
+        at = observations.direction if predicted is None else predicted
         num_lens = max((len(p) for p in self.lens_parameters), default=0)
         lens = np.zeros((len(observations.image), 2, num_lens))
         if num_lens:
@@ -140,7 +146,7 @@ class Arrangement:
             for c, camera in enumerate(observations.cameras):
                 mine = np.flatnonzero(camera_of == c)
                 parameters = self.lens_parameters[c]
-                lens[mine, :, : len(parameters)] = lens_jacobian(camera, observations.direction[mine], parameters)
+                lens[mine, :, : len(parameters)] = lens_jacobian(camera, at[mine], parameters)
         return Tracks(
             start=observations.start,
             image=observations.image.astype(np.int32),

@@ -49,7 +49,7 @@ _OPEN_RATIOS = (0.5, 0.15)
 _HOUSING_RATIOS = (0.02, 0.2)
 _PLAUSIBLE_NOISE = 1.0
 """Pixels, of a keypoint's coordinate: larger residuals let one try another start."""
-_NARROW_VIEW_DEG = 20.0
+NARROW_VIEW_DEG = 20.0
 _CLEARLY_LESS = 0.9
 _MAX_TURNS = 3
 _MAX_RELABELS = 6
@@ -119,7 +119,7 @@ def _try(
     if arrangement.options.scenario == "moving_interface":
         common = _from_common_plane(arrangement, problem, ratio, True, settings, on_progress)
         start = None if common is None else _let_loose(common, ratio, settings, on_progress)
-        if _view_deg(problem) < _NARROW_VIEW_DEG:
+        if view_deg(problem) < NARROW_VIEW_DEG:
             # A common plane may come out far from the moving ones: from where it stood at first, too.
             common = _from_common_plane(arrangement, problem, ratio, False, settings, on_progress)
             other = None if common is None else _let_loose(common, ratio, settings, on_progress)
@@ -140,7 +140,7 @@ def _through(settings: SolverSettings) -> SolverSettings:
     return replace(settings, max_num_iterations=min(60, settings.max_num_iterations), function_tolerance=1e-6)
 
 
-def _view_deg(problem: Problem) -> float:
+def view_deg(problem: Problem) -> float:
     """Full angle of the view that the keypoints fill, by and large, degrees."""
     return 2.0 * float(np.degrees(np.arccos(np.clip(np.quantile(problem.tracks.direction[:, 2], 0.05), -1.0, 1.0))))
 
@@ -273,7 +273,7 @@ def _ashore(start: Start, settings: SolverSettings, on_progress: Callable[[Progr
     if label_wet(problem)[problem.tracks.wet].all():
         return start
     for _ in range(_MAX_RELABELS):
-        wet = wet_by_fit(problem)
+        wet = _wet_by_fit(problem)
         if (wet != problem.tracks.wet).mean() <= _NEGLIGIBLE_PART or not wet.any():
             break
         problem = _widened(retriangulate(replace(problem, tracks=problem.tracks._replace(wet=wet))))
@@ -284,7 +284,19 @@ def _ashore(start: Start, settings: SolverSettings, on_progress: Callable[[Progr
     return replace(start, problem=problem, cost=_wide_cost(problem), sound=is_sound(problem))
 
 
-def wet_by_fit(problem: Problem) -> NDArray[np.bool_]:
+def label_by_fit(problem: Problem, *, doubtful: bool = False) -> NDArray[np.bool_]:
+    """Which observations (N,) look into the water, as far as the fit tells.
+
+    A plane that is not yet right, or not determined, cuts through points that are wet; only what is clearly
+    better seen straight is taken to be dry. Nothing is, unless a point lies before its plane or `doubtful`.
+    """
+    refracted = problem.structure.image_plane[problem.tracks.image] >= 0
+    if not doubtful and label_wet(problem)[refracted].all():
+        return refracted
+    return _wet_by_fit(problem)
+
+
+def _wet_by_fit(problem: Problem) -> NDArray[np.bool_]:
     """Which observations (N,) are of points that do not fit clearly better straight than through the interface."""
     refracted = problem.structure.image_plane[problem.tracks.image] >= 0
     costs = []

@@ -55,11 +55,16 @@ def label_wet(problem: Problem) -> NDArray[np.bool_]:
 
 def reprojection_errors(problem: Problem, observations: Observations) -> Array:
     """Exact refractive reprojection errors (N,) in px, through the cameras' own models."""
+    return pixel_errors(observations, predicted_directions(problem))
+
+
+def predicted_directions(problem: Problem) -> Array:
+    """Unit directions (N, 3), in the cameras' frames, in which the problem's points are seen."""
     points, normals, distances = in_cameras(problem)
     wet = problem.tracks.wet & np.isfinite(distances)
     normals, distances = np.where(wet[:, None], normals, (0.0, 0.0, 1.0)), np.where(wet, distances, 1.0)
     layers = problem.layers.with_index(problem.state.index)
-    return pixel_errors(observations, project_direction(points, normals, distances, layers, wet))
+    return project_direction(points, normals, distances, layers, wet)
 
 
 def pinhole_errors(observations: Observations) -> Array:

@@ -10,7 +10,6 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_refract.adjustment import Adjustment, Problem, SolverSettings, adjust, settle_points
 from colmap_refract.advice import Facts, advise, has_converged
@@ -18,22 +17,24 @@ from colmap_refract.alignment import Similarity, align_poses, rescale_about
 from colmap_refract.arrangement import Arrangement, arrange
 from colmap_refract.continuation import (
     MIN_DISTANCE,
+    NARROW_VIEW_DEG,
     Watch,
     estimate_noise,
     find_start,
     is_sound,
+    label_by_fit,
     named,
-    retriangulate,
     spread_out,
-    wet_by_fit,
+    view_deg,
 )
 from colmap_refract.errors import RefractError
-from colmap_refract.filtering import filter_observations, label_wet, pinhole_errors, reprojection_errors
+from colmap_refract.filtering import label_wet, pinhole_errors, reprojection_errors
 from colmap_refract.interface import Array, plane_in_cam
 from colmap_refract.model_io import copy_model
-from colmap_refract.observations import lift, read_observations
+from colmap_refract.observations import read_observations
 from colmap_refract.options import ImageNotes, RefinerOptions
 from colmap_refract.scenario import State
+from colmap_refract.selection import Selection
 from colmap_refract.sidecar import ImageInterface, Sidecar, WorldPlane
 from colmap_refract.uncertainty import Uncertainty, estimate_uncertainty
 
@@ -45,7 +46,7 @@ logger = logging.getLogger(__name__)
 LOSS_SCALE_IN_NOISE = 4.0
 """Of the default loss: wide enough to lose nothing on Gaussian noise, narrow enough to stop a wrong match."""
 _LEAST_LOSS_SCALE = 1.0
-_NUM_FILTER_ROUNDS = 3
+_NUM_FILTER_ROUNDS = 15
 _FIRST_FILTER = 2.0
 """Times the user's limit, before the first solve of all tracks."""
 _NEGLIGIBLE_CHANGE = 1e-3
@@ -68,15 +69,6 @@ class Refinement:
     sidecar: Sidecar
     warnings: tuple[str, ...]
     converged: bool
-
-
-@dataclass
-class _Counts:
-    """What was removed on the way."""
-
-    large_error: int = 0
-    small_angle: int = 0
-    unusable: int = 0
 
 
 def refine(
@@ -116,7 +108,7 @@ def refine(
     if not len(observations.points):
         raise RefractError("the model has no point that two registered images see: there is nothing to refine")
     arrangement = arrange(observations, options, notes)
-    counts = _Counts(unusable=model.compute_num_observations() - len(observations.image))
+    num_unusable = model.compute_num_observations() - len(observations.image)
     num_threads = options.num_threads if options.num_threads > 0 else _num_cores()
     settings = SolverSettings(
         num_threads=num_threads,
@@ -125,12 +117,13 @@ def refine(
     )
     solve_started = perf_counter()
     try:
-        arrangement, problem, adjustment = _solve(arrangement, settings, counts, watch)
+        selection, problem, adjustment = _solve(arrangement, settings, watch)
     except FloatingPointError as error:
         raise RefractError(
             f"the adjustment could not be evaluated ({error}): check the model and the scenario"
         ) from None
     solve_seconds = perf_counter() - solve_started
+    arrangement, _ = selection.active()
     uncertainty = estimate_uncertainty(problem)
     errors = reprojection_errors(problem, arrangement.observations)
     noise = estimate_noise(problem)
@@ -148,10 +141,9 @@ def refine(
     to_output = _output_frame(arrangement, problem.state, problem.points)
     _write_back(model, arrangement, problem, errors, to_output)
     sidecar = _sidecar(arrangement, notes, problem, adjustment, uncertainty, noise, to_output, warnings)
+    seconds = (solve_seconds, perf_counter() - started)
     sidecar.statistics.update(
-        _statistics(
-            reconstruction, model, before, errors, counts, problem, noise, solve_seconds, perf_counter() - started
-        )
+        _statistics(reconstruction, model, before, errors, selection, num_unusable, problem, noise, seconds)
     )
     return Refinement(
         reconstruction=model,
@@ -203,40 +195,46 @@ def _replace_cameras(model: pycolmap.Reconstruction, cameras: Mapping[int, pycol
 
 
 def _solve(
-    arrangement: Arrangement, settings: SolverSettings, counts: _Counts, watch: Watch | None
-) -> tuple[Arrangement, Problem, Adjustment]:
-    """Start, solve, filter and solve again, until nothing more is removed."""
+    arrangement: Arrangement, settings: SolverSettings, watch: Watch | None
+) -> tuple[Selection, Problem, Adjustment]:
+    """Start, solve, filter and solve again, until nothing more comes or goes."""
     options = arrangement.options
     start = find_start(arrangement, settings, watch)
     if not start.sound:
         _raise_unsound(start.problem)
     problem = spread_out(arrangement, start, settings)
-    arrangement, problem, _ = _relift(arrangement, problem)
-    # The start comes from a few tracks: what it finds wrong by little may be right.
-    # Nor does it tell a point's side of the plane yet: only what is clearly better seen straight is dry.
+    everything = np.ones(len(problem.tracks.image), dtype=np.bool_)
+    selection, _ = Selection(arrangement=arrangement, problem=problem, keep=everything).relifted()
+    # The start comes from a few tracks: what it finds wrong by little may be right. Nor does it tell a point's
+    # side of the plane yet: only what is clearly better seen straight is dry.
     limit = _FIRST_FILTER * options.filter_max_reproj_error
-    outlying = (reprojection_errors(problem, arrangement.observations) > limit).mean() if limit > 0 else 1.0
-    wet = wet_by_fit(problem) if outlying > _NEGLIGIBLE_CHANGE else problem.tracks.wet
-    arrangement, problem, _ = _filter(arrangement, problem, wet, settings, counts, limit)
+    errors = reprojection_errors(selection.problem, selection.arrangement.observations)
+    doubtful = limit == 0 or (errors > limit).mean() > _NEGLIGIBLE_CHANGE
+    wet = label_by_fit(selection.problem, doubtful=bool(doubtful))
+    selection, _ = selection.filtered(wet, settings, limit)
     noise = estimate_noise(start.problem)
+    narrow = view_deg(selection.problem) < NARROW_VIEW_DEG
     for round_ in range(_NUM_FILTER_ROUNDS + 1):
         stage = "Refractive bundle adjustment" + (f", filtered {round_ + 1} times" if round_ else "")
+        _, problem = selection.active()
         problem = _with_loss(arrangement, problem, noise)
         adjustment = adjust(problem, settings, on_progress=named(watch, stage))
-        problem = replace(problem, state=adjustment.state, points=adjustment.points)
-        arrangement, problem, moved = _relift(arrangement, problem)
-        arrangement, problem, changed = _filter(
-            arrangement, problem, label_wet(problem), settings, counts, options.filter_max_reproj_error
-        )
+        noise = estimate_noise(replace(problem, state=adjustment.state, points=adjustment.points))
+        selection = selection.solved(replace(problem, state=adjustment.state, points=adjustment.points))
+        selection, moved = selection.relifted()
+        wet = label_by_fit(selection.problem) if narrow else label_wet(selection.problem)
+        selection, changed = selection.filtered(wet, settings, options.filter_max_reproj_error)
         if not moved and changed <= _NEGLIGIBLE_CHANGE:
             break
-        noise = estimate_noise(problem)
-    if changed > 0:
-        # The last few outliers say too little to solve everything again for: their points alone are settled anew.
+    # What fits both ways is where the planes say it is; and the last few outliers say too little to solve everything
+    # again for: points alone are settled anew.
+    selection, last = selection.filtered(label_wet(selection.problem), settings, options.filter_max_reproj_error)
+    _, problem = selection.active()
+    if changed > 0 or last > 0:
         problem = replace(problem, points=settle_points(problem, settings))
     if not is_sound(problem):
         _raise_unsound(problem)
-    return arrangement, problem, adjustment
+    return selection, problem, adjustment
 
 
 def _with_loss(arrangement: Arrangement, problem: Problem, noise: float) -> Problem:
@@ -245,65 +243,6 @@ def _with_loss(arrangement: Arrangement, problem: Problem, noise: float) -> Prob
     if scale is None:
         scale = max(LOSS_SCALE_IN_NOISE * noise, _LEAST_LOSS_SCALE)
     return replace(problem, loss=adjustment.loss_function_type, loss_scale=scale)
-
-
-def _filter(
-    arrangement: Arrangement,
-    problem: Problem,
-    wet: NDArray[np.bool_],
-    settings: SolverSettings,
-    counts: _Counts,
-    limit: float,
-) -> tuple[Arrangement, Problem, float]:
-    """Label wet and dry anew, remove outliers over `limit` px, count them; and the part of all that this changed."""
-    relabelled = float((wet != problem.tracks.wet).mean())
-    if relabelled > 0:
-        # A point that changes sides has to move before its errors mean anything.
-        problem = retriangulate(replace(problem, tracks=problem.tracks._replace(wet=wet)))
-        problem = replace(problem, points=settle_points(problem, settings))
-    marks = filter_observations(
-        problem,
-        arrangement.observations,
-        max_reproj_error=limit,
-        min_tri_angle=arrangement.options.min_tri_angle,
-    )
-    if marks.keep.all():
-        return arrangement, problem, relabelled
-    observations = arrangement.observations.select(marks.keep)
-    if not len(observations.points):
-        raise RefractError(
-            "every point was filtered: the scenario or the intrinsics do not fit the images, or "
-            "filter_max_reproj_error is too small for this noise"
-        )
-    counts.large_error += marks.num_large_error
-    counts.small_angle += marks.num_small_angle
-    kept_points = np.isin(arrangement.observations.point3D_ids, observations.point3D_ids)
-    kept = marks.keep & np.repeat(kept_points, np.diff(problem.tracks.start))
-    arrangement = replace(arrangement, observations=observations)
-    tracks = arrangement.tracks(observations)._replace(wet=wet[kept])
-    problem = replace(problem, tracks=tracks, points=problem.points[kept_points])
-    return arrangement, problem, max(relabelled, 1.0 - float(marks.keep.mean()))
-
-
-def _relift(arrangement: Arrangement, problem: Problem) -> tuple[Arrangement, Problem, bool]:
-    """Refined intrinsics put into the cameras and the keypoints lifted anew; whether they still moved."""
-    if problem.held.lens:
-        return arrangement, problem, False
-    change = problem.state.lens
-    largest = 0.0
-    for c, camera in enumerate(arrangement.observations.cameras):
-        params = np.array(camera.params)
-        for j, index in enumerate(arrangement.lens_parameters[c]):
-            params[index] += change[c, j]
-            largest = max(largest, abs(change[c, j]) / max(abs(params[index]), 1e-3))
-        camera.params = params.tolist()
-    observations = lift(arrangement.observations)
-    if len(observations.image) != len(problem.tracks.image):
-        raise RefractError("the refined intrinsics do not see all keypoints any more: hold the distortion parameters")
-    arrangement = replace(arrangement, observations=observations)
-    tracks = arrangement.tracks(observations)._replace(wet=problem.tracks.wet)
-    state = replace(problem.state, lens=np.zeros_like(change))
-    return arrangement, replace(problem, tracks=tracks, state=state), largest > 1e-4
 
 
 def _raise_unsound(problem: Problem) -> None:
@@ -475,13 +414,14 @@ def _statistics(
     model: pycolmap.Reconstruction,
     before: Array,
     errors: Array,
-    counts: _Counts,
+    selection: Selection,
+    num_unusable: int,
     problem: Problem,
     noise: float,
-    solve_seconds: float,
-    total_seconds: float,
+    seconds: tuple[float, float],
 ) -> dict[str, Any]:
     seen = before[np.isfinite(before)]
+    marks = selection.marks
     return {
         "num_images": model.num_images(),
         "num_reg_images": model.num_reg_images(),
@@ -494,12 +434,12 @@ def _statistics(
         "mean_reprojection_error": float(errors.mean()),
         "median_reprojection_error": float(np.median(errors)),
         "noise": noise,
-        "num_filtered_large_error": counts.large_error,
-        "num_filtered_small_angle": counts.small_angle,
-        "num_unusable_observations": counts.unusable,
+        "num_filtered_large_error": marks.num_large_error if marks else 0,
+        "num_filtered_small_angle": marks.num_small_angle if marks else 0,
+        "num_unusable_observations": num_unusable,
         "num_dry_observations": int((~problem.tracks.wet).sum()),
-        "solve_seconds": solve_seconds,
-        "total_seconds": total_seconds,
+        "solve_seconds": seconds[0],
+        "total_seconds": seconds[1],
     }
 
 

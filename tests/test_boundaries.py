@@ -27,6 +27,7 @@ LAYERS = [
     {"start", "adjustment"},
     {"filtering", "uncertainty", "arrangement"},
     {"continuation", "advice"},
+    {"selection"},
     {"refinement"},
     {"__init__"},
     {"cli"},
