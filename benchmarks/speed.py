@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import resource
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from typing import Any
 import numpy as np
 
 NUM_POINTS = {100: 17_500, 500: 98_000}
+LARGE = 200
 PERTURBATION = 0.003
 """Radians, and of the camera height: what poses and points are off by at the start."""
 
@@ -147,7 +149,8 @@ def main() -> None:
     )  # fmt: skip
     lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
     for num_images in arguments.images:
-        row = measure(num_images, arguments.threads, arguments.repeats)
+        repeats = arguments.repeats if num_images <= LARGE else 1
+        row = measure(num_images, arguments.threads, repeats)
         ours, colmap = (peak_memory(num_images, arguments.threads, method) for method in ("ours", "colmap"))
         lines.append(
             f"| {num_images} | {row['observations']:.0f} | {row['ours']:.2f} | "
@@ -155,7 +158,10 @@ def main() -> None:
             f"{row['colmap_same']:.2f} ({row['colmap_same_iterations']:.0f}) | {row['ratio_same']:.2f} | "
             f"{ours:.0f} / {colmap:.0f} | {row['rmse_mm']:.2f} |"
         )
-    text = f"Medians of {arguments.repeats}, {arguments.threads} threads.\n\n" + "\n".join(lines)
+    text = (
+        f"Medians of {arguments.repeats} runs (one run over {LARGE} images), {arguments.threads} threads; "
+        f"{os.cpu_count()} cores.\n\n" + "\n".join(lines)
+    )
     print(text)
     results = Path(__file__).parent / "results"
     results.mkdir(exist_ok=True)

@@ -28,6 +28,7 @@ LAYERS = [
     {"filtering", "uncertainty", "arrangement"},
     {"continuation", "advice"},
     {"selection"},
+    {"outcome"},
     {"refinement"},
     {"__init__"},
     {"cli"},
@@ -41,7 +42,7 @@ LIBRARIES = {
     "numba": {"optics", "elimination", "triangulation"},
     "pyceres": {"adjustment"},
     "pycolmap": {
-        "observations", "cameras_file", "model_io", "simulation", "refinement", "alignment", "cli",
+        "observations", "cameras_file", "model_io", "simulation", "refinement", "outcome", "cli",
     },
     "tyro": {"cli"},
     "cv2": set(),
