@@ -9,96 +9,28 @@ trust region, the bounds, the manifolds, further residual blocks (priors) and th
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 import pyceres
-from numpy.typing import NDArray
 from scipy.linalg import lapack
 from threadpoolctl import threadpool_limits
 
-from colmap_refract import elimination
-from colmap_refract.elimination import LENS, MEDIUM, PLANE, POSE, Anchors, Optics, Tracks
-from colmap_refract.interface import Array, Layers
-from colmap_refract.optics import Media
-from colmap_refract.options import Loss
-from colmap_refract.scenario import Change, State, Structure, apply, evaluate_views
+from colmap_refract.chunk import Chunk, Problem, slot_width, split
+from colmap_refract.elimination import MEDIUM, PLANE, POSE, Anchors
+from colmap_refract.interface import Array
+from colmap_refract.scenario import Change, State, apply
 
 logger = logging.getLogger(__name__)
-
-_LOSSES = {
-    "trivial": elimination.TRIVIAL,
-    "huber": elimination.HUBER,
-    "soft_l1": elimination.SOFT_L1,
-    "cauchy": elimination.CAUCHY,
-}
 
 _JITTER = 1e-12
 """Of the scaled matrix's unit diagonal: the gauge leaves seven directions without any curvature."""
 
 _FREE_VARIANCE, _PINNED_VARIANCE = 1e6, 1e-6
 """Squared units of the solve for residuals of one px; keypoints tell a pose to 1e-6 or so."""
-
-MAX_CHUNK_COLUMNS = 700
-"""Up to this many unknowns all tracks form one chunk; beyond, Ceres' product of the Jacobian with itself,
-cubic in a chunk's unknowns, is worth splitting for."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Held:
-    """What an adjustment leaves as it is.
-
-    Attributes:
-        poses: (F,) pose blocks.
-        normals, distances: (B,) of the plane blocks.
-        points, index, lens: all of them.
-    """
-
-    poses: NDArray[np.bool_]
-    normals: NDArray[np.bool_]
-    distances: NDArray[np.bool_]
-    points: bool = False
-    index: bool = True
-    lens: bool = True
-
-    @staticmethod
-    def nothing(state: State) -> Held:
-        planes = len(state.normal)
-        return Held(
-            poses=np.zeros(len(state.rotation), bool),
-            normals=np.zeros(planes, bool),
-            distances=np.zeros(planes, bool),
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Problem:
-    """A refractive bundle adjustment: data, tying, start and robust loss, in units of the solve."""
-
-    tracks: Tracks
-    structure: Structure
-    layers: Layers
-    state: State
-    points: Array
-    held: Held
-    loss: Loss = "trivial"
-    loss_scale: float = 1.0
-    pinned_pose: int | None = None
-    """Pose block whose distance from the origin stays, so that the size does, which a wall's thickness would
-    otherwise tell, and badly."""
-
-    @property
-    def optics(self) -> Optics:
-        """The media at the state's index, for compiled code."""
-        return _optics(self.layers, self.state.index)
-
-
-def _optics(layers: Layers, index: float) -> Optics:
-    media = Media(layers.with_index(index))
-    return Optics(media.ratio, media.ratio_by_index, media.walls)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,10 +83,6 @@ class Adjustment:
     seconds: float
 
 
-class Interrupted(KeyboardInterrupt):
-    """Ctrl-C while Ceres was running; raised once it has let go of the threads."""
-
-
 @dataclass
 class _Blocks:
     """The parameter blocks given to Ceres: a key (slot, block) and the array Ceres works in."""
@@ -175,183 +103,6 @@ class _Blocks:
             else:
                 change.lens[block] = value
         return replace(change, index=index)
-
-
-def _slot_width(slot: int, state: State) -> int:
-    return (6, 3, 1, state.lens.shape[1])[slot]
-
-
-def _image_blocks(problem: Problem, image: int) -> list[tuple[int, int]]:
-    """The free blocks that an image depends on, as (slot, block)."""
-    held, structure = problem.held, problem.structure
-    blocks = []
-    pose, plane = int(structure.image_pose[image]), int(structure.image_plane[image])
-    if not held.poses[pose]:
-        blocks.append((POSE, pose))
-    if plane >= 0 and not (held.normals[plane] and held.distances[plane]):
-        blocks.append((PLANE, plane))
-    if plane >= 0 and not held.index:
-        blocks.append((MEDIUM, 0))
-    if not held.lens:
-        blocks.append((LENS, int(structure.image_camera[image])))
-    return blocks
-
-
-def _local(indices: NDArray[np.int64], used: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Positions of `indices` in the sorted array `used`; -1 stays -1."""
-    return np.where(indices < 0, -1, np.searchsorted(used, np.maximum(indices, 0)))
-
-
-class Chunk:
-    """A range of tracks with just the images that see them, and the reduced system they give."""
-
-    def __init__(self, problem: Problem, point_indices: NDArray[np.int64], num_slices: int) -> None:
-        tracks, structure = problem.tracks, problem.structure
-        lengths = np.diff(tracks.start)[point_indices]
-        start = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
-        take = np.arange(start[-1]) + np.repeat(tracks.start[point_indices] - start[:-1], lengths)
-        images = np.unique(tracks.image[take]).astype(np.int64)
-        self.point_indices = point_indices
-        self.tracks = Tracks(
-            start=start,
-            image=_local(tracks.image[take].astype(np.int64), images).astype(np.int32),
-            direction=np.ascontiguousarray(tracks.direction[take]),
-            metric=np.ascontiguousarray(tracks.metric[take]),
-            lens=np.ascontiguousarray(tracks.lens[take]),
-            wet=tracks.wet[take],
-        )
-        poses = np.unique(structure.image_pose[images])
-        planes = np.unique(structure.image_plane[images])
-        planes = planes[planes >= 0]
-        cameras = np.unique(structure.image_camera[images])
-        self.structure = Structure(
-            image_pose=_local(structure.image_pose[images], poses),
-            image_plane=_local(structure.image_plane[images], planes),
-            image_camera=_local(structure.image_camera[images], cameras),
-            sensor_rotation=structure.sensor_rotation[images],
-            sensor_translation=structure.sensor_translation[images],
-            plane_in_world=structure.plane_in_world[planes],
-            plane_anchor=structure.plane_anchor[planes],
-        )
-        state = problem.state
-        self.state = State(
-            rotation=state.rotation[poses],
-            translation=state.translation[poses],
-            normal=state.normal[planes],
-            distance=state.distance[planes],
-            index=state.index,
-            lens=state.lens[cameras],
-        )
-        self.keys: list[tuple[int, int]] = sorted({key for i in images for key in _image_blocks(problem, int(i))})
-        self.widths = [_slot_width(slot, state) for slot, _ in self.keys]
-        self.first_column = dict(zip(self.keys, np.concatenate([[0], np.cumsum(self.widths)]).tolist(), strict=False))
-        self.num_columns = int(sum(self.widths))
-        self.columns = np.full((len(images), 4), -1, dtype=np.int32)
-        for row, image in enumerate(images):
-            for key in _image_blocks(problem, int(image)):
-                self.columns[row, key[0]] = self.first_column[key]
-        self._place = {POSE: poses, PLANE: planes, MEDIUM: np.zeros(1, np.int64), LENS: cameras}
-        self._problem = problem
-        self._loss = (_LOSSES[problem.loss], problem.loss_scale)
-        self.points = np.ascontiguousarray(problem.points[point_indices])
-        self.anchors = Anchors(weight=np.zeros(len(point_indices)), position=self.points.copy())
-        # Slices of about equally many observations, for threads within the chunk.
-        bounds = np.searchsorted(start, np.linspace(0, start[-1], num_slices + 1)[1:-1])
-        edges = np.concatenate([[0], bounds, [len(point_indices)]]).astype(int)
-        self._slices = [(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True) if b > a]
-        # Where the points were last settled: Ceres linearises where it has just tried.
-        self._trial: tuple[Array, Array, float] | None = None
-
-    def views(self, parameters: Sequence[Array]) -> tuple[elimination.Views, Optics] | None:
-        """The images at Ceres' parameter values; None where a plane would lie behind its camera."""
-        change = Change.zero(self.state)
-        index = 0.0
-        for (slot, block), value in zip(self.keys, parameters, strict=True):
-            at = int(np.searchsorted(self._place[slot], block))
-            if slot == POSE:
-                change.pose[at] = value
-            elif slot == PLANE:
-                change.plane[at] = value
-            elif slot == MEDIUM:
-                index = float(value[0])
-            else:
-                change.lens[at] = value
-        change = replace(change, index=index)
-        if not all(np.isfinite(a).all() for a in (change.pose, change.plane, change.lens)):
-            return None
-        views = evaluate_views(self.structure, self.state, change, self.columns)
-        if not (views.distance > 0.0).all() or self.state.index + index <= 0.0:
-            return None
-        return views, _optics(self._problem.layers, self.state.index + index)
-
-    def _run(self, pool: ThreadPoolExecutor | None, job: Callable[[int, int, int], Any]) -> list[Any]:
-        if pool is None or len(self._slices) == 1:
-            return [job(n, a, b) for n, (a, b) in enumerate(self._slices)]
-        futures = [pool.submit(job, n, a, b) for n, (a, b) in enumerate(self._slices)]
-        return [future.result() for future in futures]
-
-    def settle(self, parameters: Sequence[Array], pool: ThreadPoolExecutor | None) -> tuple[Array, float] | None:
-        """Points at their minima for the given parameters, and the cost there."""
-        at = np.concatenate([np.zeros(0), *parameters])
-        if self._trial is not None and np.array_equal(self._trial[0], at):
-            return self._trial[1], self._trial[2]
-        state = self.views(parameters)
-        if state is None:
-            return None
-        views, optics = state
-        points = self.points.copy()
-        if self._problem.held.points:
-            out = np.empty((len(self.tracks.image), 2))
-            elimination.residuals(points, self.tracks, views, optics, out)
-            cost = 0.5 * float(robust_cost((out**2).sum(axis=1), self._problem.loss, self._problem.loss_scale).sum())
-        else:
-            cost = sum(
-                self._run(
-                    pool,
-                    lambda _, a, b: elimination.settle(
-                        points, self.anchors, a, b, self.tracks, views, optics, *self._loss
-                    ),
-                )
-            )
-        if not np.isfinite(cost):
-            return None
-        self._trial = (at, points, cost)
-        return points, cost
-
-    def reduce(self, parameters: Sequence[Array], pool: ThreadPoolExecutor | None) -> tuple[float, Array, Array] | None:
-        """Cost, gradient (n,) and Gauss-Newton matrix (n, n; upper triangle) at the given parameters."""
-        settled = self.settle(parameters, pool)
-        state = self.views(parameters)
-        if settled is None or state is None:
-            return None
-        views, optics = state
-        self.points = settled[0]
-        n = self.num_columns
-        matrices = [np.zeros((n, n)) for _ in self._slices]
-        gradients = [np.zeros(n) for _ in self._slices]
-        costs = self._run(
-            pool,
-            lambda k, a, b: elimination.reduce(
-                self.points, self._problem.held.points, self.anchors, a, b, self.tracks, views, optics,
-                *self._loss, matrices[k], gradients[k],
-            ),
-        )  # fmt: skip
-        for matrix, gradient in zip(matrices[1:], gradients[1:], strict=True):
-            matrices[0] += matrix
-            gradients[0] += gradient
-        return sum(costs), gradients[0], matrices[0]
-
-
-def robust_cost(squared: Array, loss: Loss, scale: float) -> Array:
-    """`rho` of squared residuals in px^2, as Ceres defines the losses."""
-    b = scale * scale
-    if loss == "huber":
-        return np.where(squared <= b, squared, 2.0 * scale * np.sqrt(squared) - b)
-    if loss == "soft_l1":
-        return 2.0 * b * (np.sqrt(1.0 + squared / b) - 1.0)
-    if loss == "cauchy":
-        return np.asarray(b * np.log1p(squared / b))
-    return squared
 
 
 def square_root(matrix: Array) -> Array:
@@ -436,10 +187,7 @@ class _Watch:
     on_progress: Callable[[Progress], None] | None
     num_observations: int
     exception: BaseException | None = None
-    last: Any = None
     gradient_max_norm: float = float("nan")
-    iterations: int = 0
-    history: list[float] = field(default_factory=list)
 
 
 class _Callback(pyceres.IterationCallback):  # type: ignore[misc]
@@ -468,40 +216,6 @@ class _Callback(pyceres.IterationCallback):  # type: ignore[misc]
             watch.exception = exception
             return pyceres.CallbackReturnType.SOLVER_ABORT
         return pyceres.CallbackReturnType.SOLVER_CONTINUE
-
-
-def split(problem: Problem, num_threads: int) -> list[Chunk]:
-    """Cut the tracks into chunks that touch few images each.
-
-    Points are halved along the widest axis of where their observers stand until a chunk's images have at
-    most `MAX_CHUNK_COLUMNS` unknowns (or it has few points left).
-    """
-    tracks, structure = problem.tracks, problem.structure
-    num_points = len(tracks.start) - 1
-    rotation, translation = problem.state.cam_from_world(structure)
-    centers = -np.einsum("nji,nj->ni", rotation, translation)
-    lengths = np.diff(tracks.start)
-    observer = np.add.reduceat(centers[tracks.image], tracks.start[:-1], axis=0) / lengths[:, None]
-    own = np.array([sum(_slot_width(s, problem.state) for s, _ in _image_blocks(problem, i) if s != MEDIUM)
-                    for i in range(structure.num_images)])  # fmt: skip
-    parts: list[NDArray[np.int64]] = []
-    pending = [np.arange(num_points)]
-    total = sum(_slot_width(s, problem.state) for s, _ in {k for i in range(structure.num_images)
-                                                           for k in _image_blocks(problem, i)})  # fmt: skip
-    while pending:
-        part = pending.pop()
-        if total > MAX_CHUNK_COLUMNS and len(part) > 200:
-            rows = np.repeat(tracks.start[part], lengths[part])
-            offsets = np.arange(len(rows)) - np.repeat(np.cumsum(lengths[part]) - lengths[part], lengths[part])
-            touched = np.unique(tracks.image[rows + offsets])
-            spread = np.ptp(observer[part], axis=0)
-            if own[touched].sum() > MAX_CHUNK_COLUMNS / 2 and spread.max() > 0:
-                order = np.argsort(observer[part, int(spread.argmax())], kind="stable")
-                pending += [part[order[: len(part) // 2]], part[order[len(part) // 2 :]]]
-                continue
-        parts.append(np.sort(part))
-    num_slices = num_threads if len(parts) < num_threads else 1
-    return [Chunk(problem, part, num_slices) for part in parts]
 
 
 def adjust(
@@ -534,9 +248,9 @@ def adjust(
         for chunk in chunks:
             chunk.anchors = Anchors(anchor_weights[chunk.point_indices], chunk.points.copy())
     keys = sorted({key for chunk in chunks for key in chunk.keys})
-    blocks = _Blocks(keys, {key: np.zeros(_slot_width(key[0], problem.state)) for key in keys})
+    blocks = _Blocks(keys, {key: np.zeros(slot_width(key[0], problem.state)) for key in keys})
     watch = _Watch(on_progress, len(problem.tracks.image))
-    num_slices = max((len(chunk._slices) for chunk in chunks), default=1)
+    num_slices = max((len(chunk.slices) for chunk in chunks), default=1)
     pool = ThreadPoolExecutor(num_slices) if num_slices > 1 else None
     try:
         return _solve(problem, settings, chunks, blocks, watch, pool, plane_deviations)

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_refract.adjustment import Adjustment, Problem
+from colmap_refract.adjustment import Adjustment
 from colmap_refract.arrangement import Arrangement
+from colmap_refract.chunk import Problem
 from colmap_refract.interface import Array
 from colmap_refract.uncertainty import Uncertainty
 

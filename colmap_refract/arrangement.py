@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_refract.adjustment import Held, Problem
+from colmap_refract.chunk import Held, Problem
 from colmap_refract.elimination import Tracks
 from colmap_refract.errors import RefractError
 from colmap_refract.interface import Array, Layers

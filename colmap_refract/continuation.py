@@ -17,16 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_refract import elimination
-from colmap_refract.adjustment import (
-    Adjustment,
-    Problem,
-    Progress,
-    SolverSettings,
-    adjust,
-    robust_cost,
-    settle_points,
-)
+from colmap_refract.adjustment import Adjustment, Progress, SolverSettings, adjust, settle_points
 from colmap_refract.arrangement import Arrangement, select_tracks
+from colmap_refract.chunk import Problem, robust_cost
 from colmap_refract.filtering import in_cameras, label_wet, noise
 from colmap_refract.interface import Array
 from colmap_refract.options import Loss

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_refract.adjustment import Problem
+from colmap_refract.chunk import Problem
 from colmap_refract.interface import Array
 from colmap_refract.observations import Observations, pixel_errors
 from colmap_refract.optics import is_wet, project_direction

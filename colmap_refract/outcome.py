@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from colmap_refract.adjustment import Adjustment, Problem
+from colmap_refract.adjustment import Adjustment
 from colmap_refract.advice import has_converged
 from colmap_refract.alignment import Similarity, align_poses, rescale_about
 from colmap_refract.arrangement import Arrangement
+from colmap_refract.chunk import Problem
 from colmap_refract.interface import Array, plane_in_cam
 from colmap_refract.options import ImageNotes
 from colmap_refract.scenario import State

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from colmap_refract.adjustment import Adjustment, Problem, SolverSettings, adjust, settle_points
+from colmap_refract.adjustment import Adjustment, SolverSettings, adjust, settle_points
 from colmap_refract.advice import Facts, advise, has_converged
 from colmap_refract.arrangement import Arrangement, arrange
+from colmap_refract.chunk import Problem
 from colmap_refract.continuation import (
     MIN_DISTANCE,
     NARROW_VIEW_DEG,
@@ -224,11 +225,14 @@ def _solve(
         selection, changed = selection.filtered(wet, settings, options.filter_max_reproj_error)
         if not moved and changed <= _NEGLIGIBLE_CHANGE:
             break
-    # What fits both ways is where the planes say it is; and the last few outliers say too little to solve everything
-    # again for: points alone are settled anew.
-    selection, last = selection.filtered(label_wet(selection.problem), settings, options.filter_max_reproj_error)
+    if narrow:
+        # In the end what fits both ways is where the planes say it is.
+        wet = label_wet(selection.problem)
+        selection, last = selection.filtered(wet, settings, options.filter_max_reproj_error)
+        changed = max(changed, last)
     _, problem = selection.active()
-    if changed > 0 or last > 0:
+    if changed > 0:
+        # The last few outliers say too little to solve everything again for: points alone are settled anew.
         problem = replace(problem, points=settle_points(problem, settings))
     if not is_sound(problem):
         _raise_unsound(problem)

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_refract.adjustment import Problem, SolverSettings, settle_points
+from colmap_refract.adjustment import SolverSettings, settle_points
 from colmap_refract.arrangement import Arrangement
+from colmap_refract.chunk import Problem
 from colmap_refract.continuation import retriangulate
 from colmap_refract.errors import RefractError
 from colmap_refract.filtering import Filtered, filter_observations, predicted_directions

@@ -20,7 +20,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from colmap_refract import adjustment, elimination
-from colmap_refract.adjustment import Chunk, Held, Problem, SolverSettings, adjust, robust_cost, square_root
+from colmap_refract import chunk as chunks
+from colmap_refract.adjustment import SolverSettings, adjust, square_root
+from colmap_refract.chunk import Chunk, Held, Problem, robust_cost
 from colmap_refract.elimination import LENS, MEDIUM, PLANE, POSE, Anchors, Tracks
 from colmap_refract.interface import Array, Layers, tangent_basis
 from colmap_refract.optics import project_direction
@@ -593,9 +595,9 @@ def strip(loss: Loss = "trivial", scenario: Scenario = "static_interface") -> Pr
 @pytest.mark.parametrize("loss", ["trivial", "cauchy"])
 def test_chunks_add_up(monkeypatch: pytest.MonkeyPatch, loss: Loss) -> None:
     problem = strip(loss)
-    (one,) = adjustment.split(problem, 1)
-    monkeypatch.setattr(adjustment, "MAX_CHUNK_COLUMNS", 60)
-    parts = adjustment.split(problem, 1)
+    (one,) = chunks.split(problem, 1)
+    monkeypatch.setattr(chunks, "MAX_CHUNK_COLUMNS", 60)
+    parts = chunks.split(problem, 1)
     assert len(parts) > 2
     assert sorted(np.concatenate([part.point_indices for part in parts])) == list(range(len(problem.points)))
     # Each touches its own stretch of the line.
@@ -622,7 +624,7 @@ def test_slices_add_up() -> None:
     """What threads within a chunk work on."""
     problem = make_problem("static_interface", num_points=50, loss="cauchy")
     one, many = whole(problem), whole(problem, num_slices=3)
-    assert len(many._slices) == 3
+    assert len(many.slices) == 3
     for a, b in zip(reduced(one, some_parameters(one, 1e-3)), reduced(many, some_parameters(many, 1e-3)), strict=True):
         np.testing.assert_allclose(b, a, rtol=1e-9, atol=1e-9 * np.abs(a).max())
 
@@ -637,7 +639,7 @@ def test_the_minimum_does_not_depend_on_chunks_or_threads(monkeypatch: pytest.Mo
     again = adjust(problem, SolverSettings(num_threads=2))
     assert again.cost == pytest.approx(reference.cost, rel=1e-8)
     np.testing.assert_allclose(again.points, reference.points, atol=1e-5)
-    monkeypatch.setattr(adjustment, "MAX_CHUNK_COLUMNS", 60)
+    monkeypatch.setattr(chunks, "MAX_CHUNK_COLUMNS", 60)
     for num_threads in (1, 2):
         cut = adjust(problem, SolverSettings(num_threads=num_threads))
         assert cut.termination == "convergence"

@@ -9,8 +9,8 @@ import pycolmap
 import pytest
 from conftest import Scene, Scenes
 
-from colmap_refract.adjustment import Problem
 from colmap_refract.arrangement import arrange
+from colmap_refract.chunk import Problem
 from colmap_refract.filtering import filter_observations, label_wet, noise, pinhole_errors, reprojection_errors
 from colmap_refract.interface import Array, Layers
 from colmap_refract.observations import Observations, read_observations

@@ -10,8 +10,8 @@ import pycolmap
 import pytest
 from conftest import Scene, Scenes
 
-from colmap_refract.adjustment import Problem, split
 from colmap_refract.arrangement import arrange
+from colmap_refract.chunk import Problem, split
 from colmap_refract.interface import Array, Layers
 from colmap_refract.observations import read_observations
 from colmap_refract.options import BundleAdjustmentOptions, ImageNotes, RefinerOptions, Scenario
