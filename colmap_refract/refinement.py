@@ -225,11 +225,6 @@ def _solve(
         selection, changed = selection.filtered(wet, settings, options.filter_max_reproj_error)
         if not moved and changed <= _NEGLIGIBLE_CHANGE:
             break
-    if narrow:
-        # In the end what fits both ways is where the planes say it is.
-        wet = label_wet(selection.problem)
-        selection, last = selection.filtered(wet, settings, options.filter_max_reproj_error)
-        changed = max(changed, last)
     _, problem = selection.active()
     if changed > 0:
         # The last few outliers say too little to solve everything again for: points alone are settled anew.
