@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from colmap_refract.adjustment import Adjustment
 from colmap_refract.arrangement import Arrangement
 from colmap_refract.chunk import Problem
+from colmap_refract.filtering import label_wet
 from colmap_refract.interface import Array
 from colmap_refract.uncertainty import Uncertainty
 
@@ -177,6 +178,15 @@ def _index(facts: Facts) -> list[str]:
 
 def _water(facts: Facts) -> list[str]:
     problem = facts.problem
+    block = problem.structure.image_plane[problem.tracks.image]
+    before = problem.tracks.wet & ~label_wet(problem)
+    behind = [b for b in np.unique(block[block >= 0]) if before[block == b].mean() > 0.5]
+    if behind:
+        return [
+            f"{len(behind)} of {problem.structure.num_planes} interfaces ended behind most of the points seen through "
+            "them, which cannot be: do not trust the result; try another --initial_distance_ratio, or hold what is "
+            "known of the interface."
+        ]
     refracted = problem.structure.image_plane[problem.tracks.image] >= 0
     dry = float((~problem.tracks.wet)[refracted].mean()) if refracted.any() else 0.0
     if dry > 0.5:
