@@ -39,6 +39,7 @@ _ANCHORS = (1e6, 1.0, 1e-2, 1e-4, 0.0)
 _PLANE_DEVIATIONS = (0.1, 1.0, 10.0)
 """Of normal priors on moving planes, radians and units of the solve for residuals of one px, let loose in turn."""
 _OPEN_RATIOS = (0.5, 0.15)
+_NARROW_RATIOS = (0.5, 0.15, 0.3, 0.8)
 _HOUSING_RATIOS = (0.02, 0.2)
 _PLAUSIBLE_NOISE = 1.0
 """Pixels, of a keypoint's coordinate: larger residuals let one try another start."""
@@ -81,12 +82,16 @@ def find_start(arrangement: Arrangement, settings: SolverSettings, watch: Watch 
     Raises:
         KeyboardInterrupt: Ctrl-C during a solve.
     """
-    observations = arrangement.observations
+    observations, scenario = arrangement.observations, arrangement.options.scenario
+    plausible = _PLAUSIBLE_NOISE
     few = observations.select(select_tracks(observations, _TRACKS_PER_IMAGE, arrangement.options.random_seed))
     if arrangement.ratio is not None:
         ratios: tuple[float, ...] = (arrangement.ratio,)
     else:
-        ratios = _HOUSING_RATIOS if arrangement.options.scenario == "camera_housing" else _OPEN_RATIOS
+        ratios = _HOUSING_RATIOS if scenario == "camera_housing" else _OPEN_RATIOS
+        # Moving planes in a narrow view have many minima, all with small residuals: only the least will do.
+        if view_deg(arrangement.start(ratios[0], few)) < NARROW_VIEW_DEG and scenario == "moving_interface":
+            ratios, plausible = _NARROW_RATIOS, 0.0
     starts = []
     for ratio in ratios:
         start = _try(arrangement, arrangement.start(ratio, few), ratio, settings, watch)
@@ -94,7 +99,7 @@ def find_start(arrangement: Arrangement, settings: SolverSettings, watch: Watch 
             start = _ashore(start, _through(settings), named(watch, "Dry points"))
             starts.append(start)
             logger.debug("start at %.3g of the depth: cost %.6g, sound %s", ratio, start.cost, start.sound)
-            if start.sound and estimate_noise(start.problem) < _PLAUSIBLE_NOISE:
+            if start.sound and estimate_noise(start.problem) < plausible:
                 break
     if not starts:
         raise FloatingPointError("no start value could be evaluated")
