@@ -233,11 +233,10 @@ def test_narrow_view_has_one_minimum(scenes: Scenes, scenario: Scenario, pixel_n
 
 
 @pytest.mark.parametrize("seed", [2, 3])
-def test_narrow_view_with_moving_planes_is_solved_or_said_not_to_be(scenes: Scenes, seed: int) -> None:
-    """Few points and planes that differ much: a wrong minimum may be found, but is not passed off for the right one."""
+def test_narrow_view_with_moving_planes_is_solved_by_default(scenes: Scenes, seed: int) -> None:
+    """Few points and planes that differ much have many minima, the wrong ones with residuals of a tenth of a pixel."""
     scene = scenes("moving_interface", focal_length=11440.0, pixel_noise=0.02, seed=seed)
-    right = scene.refined.sidecar.statistics["noise"] == pytest.approx(0.02, rel=0.1)
-    assert right or scene.refined.warnings
+    assert scene.refined.sidecar.statistics["noise"] == pytest.approx(0.02, rel=0.1)
 
 
 def test_uncertain_planes_do_not_unsettle_the_solution(scenes: Scenes) -> None:
