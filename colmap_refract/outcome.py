@@ -187,6 +187,7 @@ def statistics(
 ) -> dict[str, Any]:
     seen = before[np.isfinite(before)]
     marks = selection.marks
+    refracted = problem.structure.image_plane[problem.tracks.image] >= 0
     return {
         "num_images": model.num_images(),
         "num_reg_images": model.num_reg_images(),
@@ -202,7 +203,7 @@ def statistics(
         "num_filtered_large_error": marks.num_large_error if marks else 0,
         "num_filtered_small_angle": marks.num_small_angle if marks else 0,
         "num_unusable_observations": num_unusable,
-        "num_dry_observations": int((~problem.tracks.wet).sum()),
+        "num_dry_observations": int((refracted & ~problem.tracks.wet).sum()),
         "solve_seconds": seconds[0],
         "total_seconds": seconds[1],
     }
