@@ -19,10 +19,10 @@ import pyceres
 from scipy.linalg import lapack
 from threadpoolctl import threadpool_limits
 
-from colmap_refract.chunk import Chunk, Problem, slot_width, split
-from colmap_refract.elimination import MEDIUM, PLANE, POSE, Anchors
+from colmap_refract.chunk import Chunk, Problem, change_of, slot_width, split
+from colmap_refract.elimination import PLANE, POSE, Anchors
 from colmap_refract.interface import Array
-from colmap_refract.scenario import Change, State, apply
+from colmap_refract.scenario import State, apply
 
 logger = logging.getLogger(__name__)
 
@@ -89,20 +89,6 @@ class _Blocks:
 
     keys: list[tuple[int, int]]
     values: dict[tuple[int, int], Array]
-
-    def change(self, state: State) -> Change:
-        change = Change.zero(state)
-        index = 0.0
-        for (slot, block), value in self.values.items():
-            if slot == POSE:
-                change.pose[block] = value
-            elif slot == PLANE:
-                change.plane[block] = value
-            elif slot == MEDIUM:
-                index = float(value[0])
-            else:
-                change.lens[block] = value
-        return replace(change, index=index)
 
 
 def square_root(matrix: Array) -> Array:
@@ -324,7 +310,7 @@ def _solve(
     elif summary.termination_type == kind.NO_CONVERGENCE:
         termination = "no_convergence"
     return Adjustment(
-        state=apply(problem.state, blocks.change(problem.state)),
+        state=apply(problem.state, change_of(problem.state, blocks.values.items())),
         points=_settled(problem, chunks, blocks, pool),
         cost=float(summary.final_cost),
         initial_cost=float(summary.initial_cost),

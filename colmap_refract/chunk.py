@@ -6,7 +6,7 @@ unit of parallel work, and one residual block of the solver's (module `adjustmen
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -112,6 +112,22 @@ def _local(indices: NDArray[np.int64], used: NDArray[np.int64]) -> NDArray[np.in
     return np.where(indices < 0, -1, np.searchsorted(used, np.maximum(indices, 0)))
 
 
+def change_of(state: State, values: Iterable[tuple[tuple[int, int], Array]]) -> Change:
+    """The change of a state's blocks that parameter values, each with its (slot, block), stand for."""
+    change = Change.zero(state)
+    index = 0.0
+    for (slot, block), value in values:
+        if slot == POSE:
+            change.pose[block] = value
+        elif slot == PLANE:
+            change.plane[block] = value
+        elif slot == MEDIUM:
+            index = float(value[0])
+        else:
+            change.lens[block] = value
+    return replace(change, index=index)
+
+
 class Chunk:
     """A range of tracks with just the images that see them, and the reduced system they give."""
 
@@ -174,25 +190,14 @@ class Chunk:
 
     def views(self, parameters: Sequence[Array]) -> tuple[elimination.Views, Optics] | None:
         """The images at Ceres' parameter values; None where a plane would lie behind its camera."""
-        change = Change.zero(self.state)
-        index = 0.0
-        for (slot, block), value in zip(self.keys, parameters, strict=True):
-            at = int(np.searchsorted(self._place[slot], block))
-            if slot == POSE:
-                change.pose[at] = value
-            elif slot == PLANE:
-                change.plane[at] = value
-            elif slot == MEDIUM:
-                index = float(value[0])
-            else:
-                change.lens[at] = value
-        change = replace(change, index=index)
+        places = ((slot, int(np.searchsorted(self._place[slot], block))) for slot, block in self.keys)
+        change = change_of(self.state, zip(places, parameters, strict=True))
         if not all(np.isfinite(a).all() for a in (change.pose, change.plane, change.lens)):
             return None
         views = evaluate_views(self.structure, self.state, change, self.columns)
-        if not (views.distance > 0.0).all() or self.state.index + index <= 0.0:
+        if not (views.distance > 0.0).all() or self.state.index + change.index <= 0.0:
             return None
-        return views, _optics(self._problem.layers, self.state.index + index)
+        return views, _optics(self._problem.layers, self.state.index + change.index)
 
     def _run(self, pool: ThreadPoolExecutor | None, job: Callable[[int, int, int], Any]) -> list[Any]:
         if pool is None or len(self.slices) == 1:
