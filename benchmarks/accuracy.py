@@ -16,13 +16,13 @@ import numpy as np
 import pycolmap
 from tables import RESULTS, ProgressLine, publish, table
 
-from colmap_refract.adjustment import SolverSettings, adjust
-from colmap_refract.arrangement import arrange
 from colmap_refract.errors import RefractError
+from colmap_refract.estimator.adjustment import SolverSettings, adjust
 from colmap_refract.interface import Array, plane_in_world
-from colmap_refract.observations import read_observations
 from colmap_refract.options import ImageNotes, Loss, RefinerOptions, Scenario
-from colmap_refract.refinement import Refinement, refine
+from colmap_refract.refiner.arrangement import arrange
+from colmap_refract.refiner.observations import read_observations
+from colmap_refract.refiner.refinement import Refinement, refine
 from colmap_refract.simulation import Capture, SceneOptions, ignore_refraction, noise_bound, point_rmse, simulate
 
 MEDIAN_LIMIT = 1.05

@@ -20,7 +20,7 @@ from tables import RESULTS, ProgressLine, publish, table
 
 from colmap_refract.errors import RefractError
 from colmap_refract.options import RefinerOptions, Scenario
-from colmap_refract.refinement import Refinement, refine
+from colmap_refract.refiner.refinement import Refinement, refine
 from colmap_refract.simulation import SceneOptions, ignore_refraction, noise_bound, point_rmse, simulate
 
 Array = NDArray[np.float64]

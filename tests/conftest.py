@@ -13,7 +13,7 @@ import pytest
 
 from colmap_refract.interface import Array
 from colmap_refract.options import RefinerOptions, Scenario
-from colmap_refract.refinement import Refinement, refine
+from colmap_refract.refiner.refinement import Refinement, refine
 from colmap_refract.simulation import Capture, SceneOptions, ignore_refraction, noise_bound, point_rmse, simulate
 
 IMAGES_AND_POINTS = {"num_images": 12, "num_points": 200}

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from colmap_refract.alignment import Similarity, align_poses, rescale_about
+from colmap_refract.estimator.rotation import mean_rotation
 from colmap_refract.interface import Array, Layers, plane_in_cam
-from colmap_refract.rotation import mean_rotation
+from colmap_refract.refiner.alignment import Similarity, align_poses, rescale_about
 from colmap_refract.simulation import least_path_direction
 
 KNOWN_SCALES = [None, 3.5]

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from colmap_refract.cameras_file import read_cameras
 from colmap_refract.errors import RefractError
+from colmap_refract.files.cameras_file import read_cameras
 
 
 def error_of(call: Callable[[], object]) -> str:

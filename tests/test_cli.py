@@ -21,7 +21,7 @@ import pytest
 from conftest import Scene, Scenes
 
 from colmap_refract.cli import main
-from colmap_refract.sidecar import read_sidecar
+from colmap_refract.files.sidecar import read_sidecar
 from colmap_refract.simulation import SceneOptions, simulate
 
 FIVE = {f"{name}.bin" for name in ("cameras", "images", "points3D", "rigs", "frames")}

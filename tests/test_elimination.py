@@ -19,16 +19,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from colmap_refract import adjustment, elimination
-from colmap_refract import chunk as chunks
-from colmap_refract.adjustment import SolverSettings, adjust, square_root
-from colmap_refract.chunk import Chunk, Held, Problem, robust_cost
-from colmap_refract.elimination import LENS, MEDIUM, PLANE, POSE, Anchors, Tracks
+from colmap_refract.estimator import adjustment, elimination
+from colmap_refract.estimator import chunk as chunks
+from colmap_refract.estimator.adjustment import SolverSettings, adjust, square_root
+from colmap_refract.estimator.chunk import Chunk, Held, Problem, robust_cost
+from colmap_refract.estimator.elimination import LENS, MEDIUM, PLANE, POSE, Anchors, Tracks
+from colmap_refract.estimator.optics import project_direction
+from colmap_refract.estimator.rotation import exp_and_left_jacobian
+from colmap_refract.estimator.scenario import SCENARIOS, Change, State, Structure, apply, share_planes
 from colmap_refract.interface import Array, Layers, tangent_basis
-from colmap_refract.optics import project_direction
 from colmap_refract.options import Loss, Scenario
-from colmap_refract.rotation import exp_and_left_jacobian
-from colmap_refract.scenario import SCENARIOS, Change, State, Structure, apply, share_planes
 
 FOCAL_LENGTH = 1200.0
 WATER = Layers()

@@ -9,13 +9,13 @@ import pycolmap
 import pytest
 from conftest import Scene, Scenes
 
-from colmap_refract.arrangement import arrange
-from colmap_refract.chunk import Problem
-from colmap_refract.filtering import filter_observations, label_wet, noise, pinhole_errors, reprojection_errors
+from colmap_refract.estimator.chunk import Problem
+from colmap_refract.estimator.triangulation import triangulation_angles
 from colmap_refract.interface import Array, Layers
-from colmap_refract.observations import Observations, read_observations
 from colmap_refract.options import ImageNotes, RefinerOptions, Scenario
-from colmap_refract.triangulation import triangulation_angles
+from colmap_refract.refiner.arrangement import arrange
+from colmap_refract.refiner.filtering import filter_observations, label_wet, noise, pinhole_errors, reprojection_errors
+from colmap_refract.refiner.observations import Observations, read_observations
 
 WALL = Layers(thickness=(0.05,), index=(1.52, 1.333))
 

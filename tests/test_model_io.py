@@ -14,10 +14,10 @@ import numpy as np
 import pycolmap
 import pytest
 
-from colmap_refract import model_io
 from colmap_refract.errors import RefractError
-from colmap_refract.model_io import copy_model, read_model, write_model
-from colmap_refract.output import output_folder
+from colmap_refract.files import model_io
+from colmap_refract.files.model_io import copy_model, read_model, write_model
+from colmap_refract.files.output import output_folder
 
 THREE = ("cameras", "images", "points3D")
 FIVE = (*THREE, "rigs", "frames")

@@ -15,7 +15,7 @@ import pycolmap
 import pytest
 
 from colmap_refract.interface import Array
-from colmap_refract.observations import (
+from colmap_refract.refiner.observations import (
     Observations,
     lens_jacobian,
     lift,

@@ -14,8 +14,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from colmap_refract.estimator.optics import back_project, is_wet, project_direction, refract
 from colmap_refract.interface import Array, Layers
-from colmap_refract.optics import back_project, is_wet, project_direction, refract
 from colmap_refract.simulation import least_path_direction
 
 FOCAL_LENGTH = 1200.0

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from colmap_refract.errors import RefractError
-from colmap_refract.output import WORK_PREFIX, output_folder
+from colmap_refract.files.output import WORK_PREFIX, output_folder
 
 
 def snapshot(folder: Path) -> dict[str, bytes]:

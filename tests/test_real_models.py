@@ -15,7 +15,7 @@ import pytest
 
 from colmap_refract.interface import Array
 from colmap_refract.options import RefinerOptions, Scenario
-from colmap_refract.refinement import Refinement, refine
+from colmap_refract.refiner.refinement import Refinement, refine
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 SCENARIOS: tuple[Scenario, ...] = ("static_interface", "moving_interface", "camera_housing")

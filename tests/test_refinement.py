@@ -19,7 +19,7 @@ from conftest import Scene, Scenes
 from colmap_refract.errors import RefractError
 from colmap_refract.interface import Array, Layers, plane_in_world
 from colmap_refract.options import BundleAdjustmentOptions, ImageNotes, RefinerOptions, Scenario
-from colmap_refract.refinement import Refinement, refine
+from colmap_refract.refiner.refinement import Refinement, refine
 from colmap_refract.simulation import Capture, ignore_refraction, least_path_direction, noise_bound, point_rmse
 
 SCENARIOS: tuple[Scenario, ...] = get_args(Scenario)

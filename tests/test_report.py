@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 from conftest import Scenes
 
+from colmap_refract.files.sidecar import ImageInterface, Sidecar, WorldPlane, read_sidecar, write_sidecar
 from colmap_refract.interface import Layers
 from colmap_refract.options import ImageNotes, Scenario
-from colmap_refract.report import report
-from colmap_refract.sidecar import ImageInterface, Sidecar, WorldPlane, read_sidecar, write_sidecar
+from colmap_refract.refiner.report import report
 
 TILTED = (0.0, 0.6, 0.8)
 

@@ -11,10 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from colmap_refract.interface import Array, plane_in_cam, tangent_basis
-from colmap_refract.options import Scenario
-from colmap_refract.rotation import cross_matrix, exp_and_left_jacobian, mean_rotation
-from colmap_refract.scenario import (
+from colmap_refract.estimator.rotation import cross_matrix, exp_and_left_jacobian, mean_rotation
+from colmap_refract.estimator.scenario import (
     SCENARIOS,
     Change,
     State,
@@ -23,6 +21,8 @@ from colmap_refract.scenario import (
     evaluate_views,
     share_planes,
 )
+from colmap_refract.interface import Array, plane_in_cam, tangent_basis
+from colmap_refract.options import Scenario
 
 STEP = 1e-5
 """Of central differences: their error is about STEP^2 = 1e-10, and rounding adds 1e-16 / STEP = 1e-11."""

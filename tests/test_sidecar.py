@@ -15,8 +15,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from colmap_refract.errors import RefractError
+from colmap_refract.files.sidecar import ImageInterface, Sidecar, WorldPlane, read_sidecar, write_sidecar
 from colmap_refract.interface import Layers
-from colmap_refract.sidecar import ImageInterface, Sidecar, WorldPlane, read_sidecar, write_sidecar
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
 positive = st.floats(min_value=5e-324, allow_infinity=False, allow_nan=False)

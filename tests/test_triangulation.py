@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from colmap_refract.elimination import Tracks
+from colmap_refract.estimator.elimination import Tracks
+from colmap_refract.estimator.rotation import exp_and_left_jacobian
+from colmap_refract.estimator.scenario import SCENARIOS, State, Structure, share_planes
+from colmap_refract.estimator.triangulation import refracted_rays, triangulate, triangulation_angles
 from colmap_refract.interface import Array, Layers, tangent_basis
 from colmap_refract.options import Scenario
-from colmap_refract.rotation import exp_and_left_jacobian
-from colmap_refract.scenario import SCENARIOS, State, Structure, share_planes
 from colmap_refract.simulation import least_path_direction
-from colmap_refract.triangulation import refracted_rays, triangulate, triangulation_angles
 
 FOCAL_LENGTH = 1200.0
 WATER = Layers()

@@ -10,14 +10,14 @@ import pycolmap
 import pytest
 from conftest import Scene, Scenes
 
-from colmap_refract.arrangement import arrange
-from colmap_refract.chunk import Problem, split
+from colmap_refract.estimator.chunk import Problem, split
 from colmap_refract.interface import Array, Layers
-from colmap_refract.observations import read_observations
 from colmap_refract.options import BundleAdjustmentOptions, ImageNotes, RefinerOptions, Scenario
-from colmap_refract.refinement import Refinement
+from colmap_refract.refiner.arrangement import arrange
+from colmap_refract.refiner.observations import read_observations
+from colmap_refract.refiner.refinement import Refinement
+from colmap_refract.refiner.uncertainty import Key, estimate_uncertainty, gauge
 from colmap_refract.simulation import Capture, ignore_refraction
-from colmap_refract.uncertainty import Key, estimate_uncertainty, gauge
 
 SMALL = {"num_images": 8, "num_points": 120}
 

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from colmap_refract.binary_files import skip_frame, skip_rig, tables_from_binary, walk
-from colmap_refract.cameras_file import cameras_from_binary, cameras_from_text
 from colmap_refract.errors import RefractError
-from colmap_refract.model_files import (
+from colmap_refract.files.binary_files import skip_frame, skip_rig, tables_from_binary, walk
+from colmap_refract.files.cameras_file import cameras_from_binary, cameras_from_text
+from colmap_refract.files.model_files import (
     MODEL_FILES,
     MODEL_NAMES,
     NO_POINT,
@@ -28,7 +28,7 @@ from colmap_refract.model_files import (
     damaged,
     readable,
 )
-from colmap_refract.text_files import tables_from_text
+from colmap_refract.files.text_files import tables_from_text
 
 if TYPE_CHECKING:
     import pycolmap

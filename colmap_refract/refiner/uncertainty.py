@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.linalg import null_space
 from scipy.sparse.linalg import splu
 
-from colmap_refract.chunk import Problem, split
-from colmap_refract.elimination import MEDIUM, PLANE, POSE
+from colmap_refract.estimator.chunk import Problem, split
+from colmap_refract.estimator.elimination import MEDIUM, PLANE, POSE
 from colmap_refract.interface import Array, tangent_basis
 
 Key = tuple[int, int]

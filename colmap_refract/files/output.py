@@ -11,8 +11,8 @@ from pathlib import Path
 from uuid import uuid4
 
 from colmap_refract.errors import RefractError
-from colmap_refract.model_files import MODEL_FILES
-from colmap_refract.sidecar import SIDECAR_NAME
+from colmap_refract.files.model_files import MODEL_FILES
+from colmap_refract.files.sidecar import SIDECAR_NAME
 
 # What a folder that we write to must not keep of an earlier run.
 OWN_FILES = (*MODEL_FILES, SIDECAR_NAME)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_refract.model_files import KEYPOINT, NO_ID, POINT, TRACK_ELEMENT, Tables, damaged
+from colmap_refract.files.model_files import KEYPOINT, NO_ID, POINT, TRACK_ELEMENT, Tables, damaged
 
 
 def tables_from_text(images_file: Path, points_file: Path) -> Tables:

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_refract.chunk import Problem
+from colmap_refract.estimator.chunk import Problem
+from colmap_refract.estimator.optics import is_wet, project_direction
+from colmap_refract.estimator.triangulation import triangulation_angles
 from colmap_refract.interface import Array
-from colmap_refract.observations import Observations, pixel_errors
-from colmap_refract.optics import is_wet, project_direction
-from colmap_refract.triangulation import triangulation_angles
+from colmap_refract.refiner.observations import Observations, pixel_errors
 
 
 @dataclass(frozen=True, kw_only=True)

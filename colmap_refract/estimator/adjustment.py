@@ -19,10 +19,10 @@ import pyceres
 from scipy.linalg import lapack
 from threadpoolctl import threadpool_limits
 
-from colmap_refract.chunk import Chunk, Problem, change_of, slot_width, split
-from colmap_refract.elimination import PLANE, POSE, Anchors
+from colmap_refract.estimator.chunk import Chunk, Problem, change_of, slot_width, split
+from colmap_refract.estimator.elimination import PLANE, POSE, Anchors
+from colmap_refract.estimator.scenario import State, apply
 from colmap_refract.interface import Array
-from colmap_refract.scenario import State, apply
 
 logger = logging.getLogger(__name__)
 

@@ -19,8 +19,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from colmap_refract.estimator.optics import FAST, one_interface, slope_derivatives, snell_root
 from colmap_refract.interface import Array
-from colmap_refract.optics import FAST, one_interface, slope_derivatives, snell_root
 
 POSE, PLANE, MEDIUM, LENS = range(4)
 """The slots of an image."""

@@ -8,14 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_refract.chunk import Held, Problem
-from colmap_refract.elimination import Tracks
 from colmap_refract.errors import RefractError
+from colmap_refract.estimator.chunk import Held, Problem
+from colmap_refract.estimator.elimination import Tracks
+from colmap_refract.estimator.scenario import Index, State, Structure, share_planes
 from colmap_refract.interface import Array, Layers
-from colmap_refract.observations import Observations, lens_jacobian
 from colmap_refract.options import ImageNotes, RefinerOptions, Scenario
-from colmap_refract.scenario import Index, State, Structure, share_planes
-from colmap_refract.start import image_depths, start_planes
+from colmap_refract.refiner.observations import Observations, lens_jacobian
+from colmap_refract.refiner.start import image_depths, start_planes
 
 logger = logging.getLogger(__name__)
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from colmap_refract.sidecar import ImageInterface, Sidecar
+from colmap_refract.files.sidecar import ImageInterface, Sidecar
 
 _WIDTH = 78
 _MOST_ROWS = 20

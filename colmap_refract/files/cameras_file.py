@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from colmap_refract.binary_files import walk
 from colmap_refract.errors import RefractError
-from colmap_refract.model_files import NO_ID, damaged, readable
-from colmap_refract.text_files import is_comment, lines_of
+from colmap_refract.files.binary_files import walk
+from colmap_refract.files.model_files import NO_ID, damaged, readable
+from colmap_refract.files.text_files import is_comment, lines_of
 
 if TYPE_CHECKING:
     import pycolmap

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_refract import elimination
-from colmap_refract.elimination import LENS, MEDIUM, PLANE, POSE, Anchors, Optics, Tracks
+from colmap_refract.estimator import elimination
+from colmap_refract.estimator.elimination import LENS, MEDIUM, PLANE, POSE, Anchors, Optics, Tracks
+from colmap_refract.estimator.optics import Media
+from colmap_refract.estimator.scenario import Change, State, Structure, evaluate_views
 from colmap_refract.interface import Array, Layers
-from colmap_refract.optics import Media
 from colmap_refract.options import Loss
-from colmap_refract.scenario import Change, State, Structure, evaluate_views
 
 _LOSSES = {
     "trivial": elimination.TRIVIAL,

@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_refract.adjustment import SolverSettings, settle_points
-from colmap_refract.arrangement import Arrangement
-from colmap_refract.chunk import Problem
-from colmap_refract.continuation import retriangulate
 from colmap_refract.errors import RefractError
-from colmap_refract.filtering import Filtered, filter_observations, predicted_directions
-from colmap_refract.observations import lift
+from colmap_refract.estimator.adjustment import SolverSettings, settle_points
+from colmap_refract.estimator.chunk import Problem
+from colmap_refract.refiner.arrangement import Arrangement
+from colmap_refract.refiner.continuation import retriangulate
+from colmap_refract.refiner.filtering import Filtered, filter_observations, predicted_directions
+from colmap_refract.refiner.observations import lift
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from colmap_refract.estimator.rotation import mean_rotation
 from colmap_refract.interface import Array
-from colmap_refract.rotation import mean_rotation
 
 _ROUNDS = 10
 

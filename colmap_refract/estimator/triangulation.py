@@ -8,10 +8,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from colmap_refract.elimination import Tracks
+from colmap_refract.estimator.elimination import Tracks
+from colmap_refract.estimator.optics import FAST, back_project
+from colmap_refract.estimator.scenario import State, Structure
 from colmap_refract.interface import Array, Layers
-from colmap_refract.optics import FAST, back_project
-from colmap_refract.scenario import State, Structure
 
 _ROUNDS = 6
 _MIN_DETERMINANT = 1e-9

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_refract.estimator.scenario import Index
 from colmap_refract.interface import Array
-from colmap_refract.scenario import Index
 
 if TYPE_CHECKING:
     import pycolmap

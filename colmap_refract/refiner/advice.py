@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_refract.adjustment import Adjustment
-from colmap_refract.arrangement import Arrangement
-from colmap_refract.chunk import Problem
-from colmap_refract.filtering import label_wet
+from colmap_refract.estimator.adjustment import Adjustment
+from colmap_refract.estimator.chunk import Problem
 from colmap_refract.interface import Array
-from colmap_refract.uncertainty import Uncertainty
+from colmap_refract.refiner.arrangement import Arrangement
+from colmap_refract.refiner.filtering import label_wet
+from colmap_refract.refiner.uncertainty import Uncertainty
 
 _NORMAL_LIMIT_DEG = 2.0
 _DISTANCE_LIMIT = 0.1

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_refract.errors import RefractError
-from colmap_refract.model_files import KEYPOINT, POINT, TRACK_ELEMENT, Tables, damaged
+from colmap_refract.files.model_files import KEYPOINT, POINT, TRACK_ELEMENT, Tables, damaged
 
 POSE_SIZE = 7 * 8
 

@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from colmap_refract.adjustment import Adjustment
-from colmap_refract.advice import has_converged
-from colmap_refract.alignment import Similarity, align_poses, rescale_about
-from colmap_refract.arrangement import Arrangement
-from colmap_refract.chunk import Problem
+from colmap_refract.estimator.adjustment import Adjustment
+from colmap_refract.estimator.chunk import Problem
+from colmap_refract.estimator.scenario import State
+from colmap_refract.files.sidecar import ImageInterface, Sidecar, WorldPlane
 from colmap_refract.interface import Array, plane_in_cam
 from colmap_refract.options import ImageNotes
-from colmap_refract.scenario import State
-from colmap_refract.selection import Selection
-from colmap_refract.sidecar import ImageInterface, Sidecar, WorldPlane
-from colmap_refract.uncertainty import Uncertainty
+from colmap_refract.refiner.advice import has_converged
+from colmap_refract.refiner.alignment import Similarity, align_poses, rescale_about
+from colmap_refract.refiner.arrangement import Arrangement
+from colmap_refract.refiner.selection import Selection
+from colmap_refract.refiner.uncertainty import Uncertainty
 
 if TYPE_CHECKING:
     import pycolmap

@@ -22,10 +22,10 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_refract.elimination import Views
+from colmap_refract.estimator.elimination import Views
+from colmap_refract.estimator.rotation import cross_matrix, exp_and_left_jacobian
 from colmap_refract.interface import Array, tangent_basis
 from colmap_refract.options import Scenario
-from colmap_refract.rotation import cross_matrix, exp_and_left_jacobian
 
 SCENARIOS: tuple[Scenario, ...] = get_args(Scenario)
 

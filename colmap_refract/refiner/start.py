@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from colmap_refract.estimator.scenario import Structure
 from colmap_refract.interface import Array
-from colmap_refract.observations import Observations
-from colmap_refract.scenario import Structure
+from colmap_refract.refiner.observations import Observations
 
 _LEVEL_PRIOR = 0.1
 """Weight of the mean viewing direction against the cameras' own spread, in squared depths: what decides the

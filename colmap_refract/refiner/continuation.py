@@ -16,16 +16,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_refract import elimination
-from colmap_refract.adjustment import Adjustment, Progress, SolverSettings, adjust, settle_points
-from colmap_refract.arrangement import Arrangement, select_tracks
-from colmap_refract.chunk import Problem, robust_cost
-from colmap_refract.filtering import in_cameras, label_wet, noise
+from colmap_refract.estimator import elimination
+from colmap_refract.estimator.adjustment import Adjustment, Progress, SolverSettings, adjust, settle_points
+from colmap_refract.estimator.chunk import Problem, robust_cost
+from colmap_refract.estimator.scenario import Change, evaluate_views
+from colmap_refract.estimator.triangulation import triangulate
 from colmap_refract.interface import Array
 from colmap_refract.options import Loss
-from colmap_refract.scenario import Change, evaluate_views
-from colmap_refract.start import start_planes, world_plane
-from colmap_refract.triangulation import triangulate
+from colmap_refract.refiner.arrangement import Arrangement, select_tracks
+from colmap_refract.refiner.filtering import in_cameras, label_wet, noise
+from colmap_refract.refiner.start import start_planes, world_plane
 
 logger = logging.getLogger(__name__)
 

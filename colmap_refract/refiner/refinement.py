@@ -11,11 +11,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from colmap_refract.adjustment import Adjustment, SolverSettings, adjust, settle_points
-from colmap_refract.advice import Facts, advise, has_converged
-from colmap_refract.arrangement import Arrangement, arrange
-from colmap_refract.chunk import Problem
-from colmap_refract.continuation import (
+from colmap_refract.errors import RefractError
+from colmap_refract.estimator.adjustment import Adjustment, SolverSettings, adjust, settle_points
+from colmap_refract.estimator.chunk import Problem
+from colmap_refract.files.model_io import copy_model
+from colmap_refract.files.sidecar import Sidecar
+from colmap_refract.options import ImageNotes, RefinerOptions
+from colmap_refract.refiner.advice import Facts, advise, has_converged
+from colmap_refract.refiner.arrangement import Arrangement, arrange
+from colmap_refract.refiner.continuation import (
     MIN_DISTANCE,
     NARROW_VIEW_DEG,
     Watch,
@@ -27,15 +31,11 @@ from colmap_refract.continuation import (
     spread_out,
     view_deg,
 )
-from colmap_refract.errors import RefractError
-from colmap_refract.filtering import label_wet, pinhole_errors, reprojection_errors
-from colmap_refract.model_io import copy_model
-from colmap_refract.observations import read_observations
-from colmap_refract.options import ImageNotes, RefinerOptions
-from colmap_refract.outcome import make_sidecar, output_frame, statistics, write_back
-from colmap_refract.selection import Selection
-from colmap_refract.sidecar import Sidecar
-from colmap_refract.uncertainty import estimate_uncertainty
+from colmap_refract.refiner.filtering import label_wet, pinhole_errors, reprojection_errors
+from colmap_refract.refiner.observations import read_observations
+from colmap_refract.refiner.outcome import make_sidecar, output_frame, statistics, write_back
+from colmap_refract.refiner.selection import Selection
+from colmap_refract.refiner.uncertainty import estimate_uncertainty
 
 if TYPE_CHECKING:
     import pycolmap
