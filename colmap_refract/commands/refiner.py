@@ -31,6 +31,9 @@ class Refiner:
     """Text file with lines `IMAGE_NAME GROUP`: the images of a group share one interface."""
     dry_image_list_path: Path | None = None
     """Text file with the name of an image per line that was taken without an interface."""
+    database_path: Path | None = None
+    """COLMAP database of the model. With it, tracks that refraction cost are merged, completed and
+    triangulated from all its matches with refracted rays, and the model is refined again."""
     overwrite: bool = False
     """Replace a model that is at output_path."""
 
@@ -49,10 +52,19 @@ class Refiner:
                 interface_groups=read_groups(self.interface_group_path),
                 dry_images=frozenset(read_names(self.dry_image_list_path)),
             )
-            from colmap_refract.refiner.refinement import refine
-
             with ProgressLine() as line:
-                result = refine(model, self.options, notes=notes, cameras=cameras, watch=line.show)
+                if self.database_path is None:
+                    from colmap_refract.refiner.refinement import refine
+
+                    result = refine(model, self.options, notes=notes, cameras=cameras, watch=line.show)
+                else:
+                    from colmap_refract.mapping.database import read_correspondences
+                    from colmap_refract.mapping.retriangulation import refine_with_database
+
+                    matches = read_correspondences(self.database_path, verified=False)
+                    result = refine_with_database(
+                        model, self.options, matches, notes=notes, cameras=cameras, watch=line.show
+                    )
             write_model(result.reconstruction, folder)
             write_sidecar(result.sidecar, folder / SIDECAR_NAME)
         print(report(result.sidecar))

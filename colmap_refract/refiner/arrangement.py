@@ -12,7 +12,8 @@ from colmap_refract.errors import RefractError
 from colmap_refract.estimator.chunk import Held, Problem
 from colmap_refract.estimator.elimination import Tracks
 from colmap_refract.estimator.scenario import Index, State, Structure, share_planes
-from colmap_refract.interface import Array, Layers
+from colmap_refract.files.sidecar import Sidecar
+from colmap_refract.interface import Array, Layers, plane_in_cam, plane_in_world
 from colmap_refract.options import ImageNotes, RefinerOptions, Scenario
 from colmap_refract.refiner.observations import Observations, lens_jacobian
 from colmap_refract.refiner.start import image_depths, start_planes
@@ -131,6 +132,46 @@ class Arrangement:
             pinned_pose=self.pinned_pose,
         )
 
+    def resume(self, earlier: Sidecar) -> Problem:
+        """The adjustment of all observations, from the interfaces of an earlier one of the same images.
+
+        An image that had no part in that one starts from the mean of the others' interfaces.
+        """
+        observations, structure = self.observations, self.structure
+        problem = self.start(0.5, observations)
+        rotation, translation = observations.cam_from_world
+        in_cam: list[tuple[Array, float] | None] = []
+        for name in observations.image_names:
+            image = earlier.images.get(name)
+            known = image is not None and image.normal_in_cam is not None and image.distance is not None
+            in_cam.append((np.array(image.normal_in_cam), image.distance / self.unit) if known else None)  # type: ignore
+        in_world = [
+            None if plane is None else plane_in_world(*plane, rotation[i], translation[i])
+            for i, plane in enumerate(in_cam)
+        ]
+        normal, distance = problem.state.normal.copy(), problem.state.distance.copy()
+        for block in range(structure.num_planes):
+            images = np.flatnonzero(structure.image_plane == block).tolist()
+            fixed_in_world = bool(structure.plane_in_world[block])
+            new = not any(in_cam[i] is not None for i in images)
+            # A plane that nobody has seen yet is like the others, in the frame that those are alike in.
+            like = range(len(in_cam)) if new else images
+            alike_in_world = fixed_in_world or (new and self.options.scenario != "camera_housing")
+            found = [plane for i in like if (plane := (in_world if alike_in_world else in_cam)[i]) is not None]
+            if not found:
+                continue
+            mean = np.mean([n for n, _ in found], axis=0)
+            mean, offset = mean / np.linalg.norm(mean), float(np.mean([d for _, d in found]))
+            if fixed_in_world:
+                normal[block], distance[block] = mean, offset - mean @ structure.plane_anchor[block]
+            elif alike_in_world:
+                normal[block], distance[block] = plane_in_cam(mean, offset, rotation[images[0]], translation[images[0]])
+            else:
+                normal[block], distance[block] = mean, offset
+        state = replace(problem.state, normal=normal, distance=distance, index=earlier.layers.refractive_index)
+        layers = self.layers(float(state.planes_in_cam(structure)[1][self.reference]))
+        return replace(problem, state=state, layers=layers)
+
     def tracks(self, observations: Observations, predicted: Array | None = None) -> Tracks:
         """The kernel's view of observations, all of images with an interface taken to be wet.
 
@@ -157,8 +198,13 @@ class Arrangement:
         )
 
 
-def arrange(observations: Observations, options: RefinerOptions, notes: ImageNotes) -> Arrangement:
+def arrange(
+    observations: Observations, options: RefinerOptions, notes: ImageNotes, *, refined: bool = False
+) -> Arrangement:
     """Tie the images of a model according to the scenario, in units of the solve.
+
+    Args:
+        refined: whether poses and points are those of an earlier refinement, and so right with a fixed camera, too.
 
     Raises:
         RefractError: an image name that is not in the model, a group that says two things, too few points
@@ -181,7 +227,9 @@ def arrange(observations: Observations, options: RefinerOptions, notes: ImageNot
 
     frame_pose = np.arange(len(observations.frame_ids))
     if scenario == "fixed_camera":
-        observations, frame_pose = _fix_camera(observations, reference, options.BundleAdjustment.refine_points3D)
+        observations, frame_pose = _fix_camera(
+            observations, reference, options.BundleAdjustment.refine_points3D and not refined
+        )
     moved, origin, unit = _to_solve_units(observations, reference)
     rotation, translation = moved.cam_from_world
     centers = -np.einsum("nji,nj->ni", rotation, translation)

@@ -76,6 +76,7 @@ def refine(
     *,
     notes: ImageNotes | None = None,
     cameras: Mapping[int, pycolmap.Camera] | None = None,
+    earlier: Sidecar | None = None,
     watch: Watch | None = None,
 ) -> Refinement:
     """Refine a model whose images were taken through plane interfaces.
@@ -86,6 +87,8 @@ def refine(
         notes: which images share an interface, and which have none.
         cameras: intrinsics calibrated in air by camera id, in place of the model's. A single camera
             stands for all of the model's, whatever its id.
+        earlier: of the refinement that the model comes from, if it does: its interfaces are the start, and none
+            is sought.
         watch: called with the stage's name and the solver's progress after every iteration.
 
     Returns:
@@ -106,7 +109,7 @@ def refine(
         observations = read_observations(model)
     if not len(observations.points):
         raise RefractError("the model has no point that two registered images see: there is nothing to refine")
-    arrangement = arrange(observations, options, notes)
+    arrangement = arrange(observations, options, notes, refined=earlier is not None)
     num_unusable = model.compute_num_observations() - len(observations.image)
     num_threads = options.num_threads if options.num_threads > 0 else _num_cores()
     settings = SolverSettings(
@@ -116,7 +119,7 @@ def refine(
     )
     solve_started = perf_counter()
     try:
-        selection, problem, adjustment = _solve(arrangement, settings, watch)
+        selection, problem, adjustment = _solve(arrangement, settings, earlier, watch)
     except FloatingPointError as error:
         raise RefractError(
             f"the adjustment could not be evaluated ({error}): check the model and the scenario"
@@ -194,24 +197,21 @@ def _replace_cameras(model: pycolmap.Reconstruction, cameras: Mapping[int, pycol
 
 
 def _solve(
-    arrangement: Arrangement, settings: SolverSettings, watch: Watch | None
+    arrangement: Arrangement, settings: SolverSettings, earlier: Sidecar | None, watch: Watch | None
 ) -> tuple[Selection, Problem, Adjustment]:
     """Start, solve, filter and solve again, until nothing more comes or goes."""
     options = arrangement.options
-    start = find_start(arrangement, settings, watch)
-    if not start.sound:
-        _raise_unsound(start.problem)
-    problem = spread_out(arrangement, start, settings)
-    everything = np.ones(len(problem.tracks.image), dtype=np.bool_)
-    selection, _ = Selection(arrangement=arrangement, problem=problem, keep=everything).relifted()
-    # The start comes from a few tracks: what it finds wrong by little may be right. Nor does it tell a point's
-    # side of the plane yet: only what is clearly better seen straight is dry.
+    begin = _from_scratch(arrangement, settings, watch) if earlier is None else arrangement.resume(earlier)
+    noise = estimate_noise(begin)
+    everything = np.ones(len(begin.tracks.image), dtype=np.bool_)
+    selection, _ = Selection(arrangement=arrangement, problem=begin, keep=everything).relifted()
+    # The start comes from a few tracks, or from others: what it finds wrong by little may be right. Nor does it tell
+    # a point's side of the plane yet: only what is clearly better seen straight is dry.
     limit = _FIRST_FILTER * options.filter_max_reproj_error
     errors = reprojection_errors(selection.problem, selection.arrangement.observations)
     doubtful = limit == 0 or (errors > limit).mean() > _NEGLIGIBLE_CHANGE
     wet = label_by_fit(selection.problem, doubtful=bool(doubtful))
     selection, _ = selection.filtered(wet, settings, limit)
-    noise = estimate_noise(start.problem)
     narrow = view_deg(selection.problem) < NARROW_VIEW_DEG
     for round_ in range(_NUM_FILTER_ROUNDS + 1):
         stage = "Refractive bundle adjustment" + (f", filtered {round_ + 1} times" if round_ else "")
@@ -232,6 +232,14 @@ def _solve(
     if not is_sound(problem):
         _raise_unsound(problem)
     return selection, problem, adjustment
+
+
+def _from_scratch(arrangement: Arrangement, settings: SolverSettings, watch: Watch | None) -> Problem:
+    """All observations, from a start that is sought."""
+    start = find_start(arrangement, settings, watch)
+    if not start.sound:
+        _raise_unsound(start.problem)
+    return spread_out(arrangement, start, settings)
 
 
 def _with_loss(arrangement: Arrangement, problem: Problem, noise: float) -> Problem:

@@ -54,6 +54,15 @@ def _model(sidecar: Sidecar) -> list[str]:
         _row("Observations", f"{before} before, {after} after"),
         _row("Filtered", removed),
     ]
+    gained = [
+        (s.get("num_completed_observations"), "observations added"),
+        (s.get("num_merged_points3D"), "points merged into others"),
+        (s.get("num_created_points3D"), "points created"),
+    ]
+    if any(count is not None for count, _ in gained):
+        lines.append(
+            _row("From the database", ", ".join(f"{count} {what}" for count, what in gained if count) or "nothing")
+        )
     if s.get("num_dry_observations"):
         lines.append(_row("Observations of dry points", str(s["num_dry_observations"])))
     lines += [
