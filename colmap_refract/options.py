@@ -85,6 +85,10 @@ class RefinerOptions:
     """Name of the image that interface_distance and interface_normal speak of, and whose pose a fixed
     camera keeps. By default the one with most observations."""
 
+    average_groups: bool = False
+    """Average the keypoints of each interface group per track before solving, weighted by their
+    spread. For the frames of a fixed camera."""
+
     filter_max_reproj_error: float = 4.0
     """Observations with a larger refractive reprojection error, px, are removed. 0: keep all."""
     filter_min_tri_angle: float | None = None

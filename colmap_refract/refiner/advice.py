@@ -71,7 +71,10 @@ def _solver(facts: Facts) -> list[str]:
 def _images(facts: Facts) -> list[str]:
     """Images that the filter left without anything."""
     observations = facts.arrangement.observations
-    counts = np.bincount(observations.image, minlength=len(observations.image_ids))
+    structure = facts.problem.structure
+    # A frame that was averaged with others lives on in the one that stands for them.
+    both = structure.image_pose * (structure.num_planes + 1) + structure.image_plane
+    counts = np.bincount(both[observations.image], minlength=both.max() + 1)[both]
     lost = [observations.image_names[i] for i in np.flatnonzero(counts == 0)]
     if not lost:
         return []

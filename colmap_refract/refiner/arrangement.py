@@ -188,6 +188,8 @@ class Arrangement:
                 mine = np.flatnonzero(camera_of == c)
                 parameters = self.lens_parameters[c]
                 lens[mine, :, : len(parameters)] = lens_jacobian(camera, at[mine], parameters)
+            if observations.weight is not None:
+                lens *= observations.weight[:, None, None]
         return Tracks(
             start=observations.start,
             image=observations.image.astype(np.int32),

@@ -480,8 +480,11 @@ def spread_out(arrangement: Arrangement, start: Start, settings: SolverSettings)
 
 def estimate_noise(problem: Problem) -> float:
     """Noise of a keypoint coordinate, px, that the residuals of a solution show."""
+    structure, seen = problem.structure, np.unique(problem.tracks.image)
     unknowns = 0 if problem.held.points else 3 * len(problem.points)
-    return noise(residuals(problem), unknowns + 9 * problem.structure.num_images)
+    unknowns += 6 * int((~problem.held.poses[np.unique(structure.image_pose[seen])]).sum())
+    unknowns += 3 * len(np.unique(structure.image_plane[seen]))
+    return noise(residuals(problem), unknowns)
 
 
 def named(watch: Watch | None, stage: str) -> Callable[[Progress], None] | None:

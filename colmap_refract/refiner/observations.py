@@ -41,7 +41,8 @@ class Observations:
         point3D_ids: (P,) and points: (P, 3), world.
         start: (P + 1,) first observation of each point.
         image: (N,) index of the image, point2D_idx: (N,), pixel: (N, 2) keypoints.
-        direction: (N, 3) unit, metric: (N, 2, 3) px per unit of direction.
+        direction: (N, 3) unit, metric: (N, 2, 3) px per unit of direction, times the weight.
+        weight: (N,) a typical keypoint's standard deviation over each one's own; None where all are alike.
         num_unliftable: keypoints that the camera model cannot invert; they are left out.
     """
 
@@ -65,6 +66,7 @@ class Observations:
     pixel: Array
     direction: Array
     metric: Array
+    weight: Array | None = None
     num_unliftable: int = 0
 
     @property
@@ -94,6 +96,7 @@ class Observations:
             pixel=self.pixel[keep],
             direction=self.direction[keep],
             metric=self.metric[keep],
+            weight=None if self.weight is None else self.weight[keep],
         )
 
 
@@ -173,6 +176,8 @@ def lift(observations: Observations) -> Observations:
         off = np.abs(_shortest(camera, _project(camera, ray) - pixel)).max(axis=1, initial=0.0)
         direction[mine] = np.where((off < _ROUND_TRIP)[:, None], ray, np.nan)
         metric[mine] = pixel_metric(camera, direction[mine])
+    if observations.weight is not None:
+        metric *= observations.weight[:, None, None]
     lifted = replace(observations, direction=direction, metric=metric)
     fine = np.asarray(np.isfinite(direction).all(axis=1) & np.isfinite(metric).all(axis=(1, 2)))
     return replace(lifted.select(fine), num_unliftable=int((~fine).sum()))

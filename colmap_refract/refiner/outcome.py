@@ -16,6 +16,7 @@ from colmap_refract.options import ImageNotes
 from colmap_refract.refiner.advice import has_converged
 from colmap_refract.refiner.alignment import Similarity, align_poses, rescale_about
 from colmap_refract.refiner.arrangement import Arrangement
+from colmap_refract.refiner.observations import Observations
 from colmap_refract.refiner.selection import Selection
 from colmap_refract.refiner.uncertainty import Uncertainty
 
@@ -59,9 +60,14 @@ def output_frame(arrangement: Arrangement, state: State, points: Array) -> Simil
 
 
 def write_back(
-    model: pycolmap.Reconstruction, arrangement: Arrangement, problem: Problem, errors: Array, to_output: Similarity
+    model: pycolmap.Reconstruction,
+    arrangement: Arrangement,
+    problem: Problem,
+    errors: Array,
+    to_output: Similarity,
+    stays: Observations,
 ) -> None:
-    """Poses, points, errors and intrinsics into the model, and what was removed out of it."""
+    """Poses, points, errors and intrinsics into the model, and what is not in `stays` out of it."""
     import pycolmap
 
     observations, state = arrangement.observations, problem.state
@@ -81,8 +87,8 @@ def write_back(
     for camera_id, camera in zip(observations.camera_ids, observations.cameras, strict=True):
         model.camera(int(camera_id)).params = list(camera.params)
     kept_points = set(observations.point3D_ids.tolist())
-    image_id = observations.image_ids[observations.image]
-    kept = set(zip(image_id.tolist(), observations.point2D_idx.tolist(), strict=True))
+    image_id = stays.image_ids[stays.image]
+    kept = set(zip(image_id.tolist(), stays.point2D_idx.tolist(), strict=True))
     for point3D_id in list(model.point3D_ids()):
         if point3D_id not in kept_points:
             model.delete_point3D(point3D_id)

@@ -19,6 +19,7 @@ from colmap_refract.files.sidecar import Sidecar
 from colmap_refract.options import ImageNotes, RefinerOptions
 from colmap_refract.refiner.advice import Facts, advise, has_converged
 from colmap_refract.refiner.arrangement import Arrangement, arrange
+from colmap_refract.refiner.averaging import average_groups
 from colmap_refract.refiner.continuation import (
     MIN_DISTANCE,
     NARROW_VIEW_DEG,
@@ -109,7 +110,10 @@ def refine(
         observations = read_observations(model)
     if not len(observations.points):
         raise RefractError("the model has no point that two registered images see: there is nothing to refine")
-    arrangement = arrange(observations, options, notes, refined=earlier is not None)
+    averaged = average_groups(observations, options, notes.interface_groups) if options.average_groups else None
+    arrangement = arrange(
+        observations if averaged is None else averaged.observations, options, notes, refined=earlier is not None
+    )
     num_unusable = model.compute_num_observations() - len(observations.image)
     num_threads = options.num_threads if options.num_threads > 0 else _num_cores()
     settings = SolverSettings(
@@ -141,7 +145,8 @@ def refine(
     )
     warnings = advise(facts)
     to_output = output_frame(arrangement, problem.state, problem.points)
-    write_back(model, arrangement, problem, errors, to_output)
+    stays = arrangement.observations if averaged is None else observations.select(averaged.members(selection.keep))
+    write_back(model, arrangement, problem, errors, to_output, stays)
     sidecar = make_sidecar(arrangement, notes, problem, adjustment, uncertainty, noise, to_output, warnings)
     seconds = (solve_seconds, perf_counter() - started)
     sidecar.statistics.update(
