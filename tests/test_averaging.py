@@ -52,7 +52,7 @@ def test_means_are_those_of_the_keypoints() -> None:
         assert len({groups[single.image_names[i]] for i in single.image[mine]}) == 1
         np.testing.assert_allclose(means.pixel[row], single.pixel[mine].mean(axis=0), atol=1e-9)
     # Eight keypoints at 0.5 px; with the same number in each mean all weigh about the same.
-    assert np.median(means.weight) == pytest.approx(1.0)
+    assert np.median(means.weight) == pytest.approx(1.0, abs=0.01)
     assert means.weight.std() < 0.3
 
 
