@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 import logging
+import operator
 import sys
 from typing import Annotated, Any
 
 import tyro
 
+from colmap_refract.commands.camera_calibrator import CameraCalibrator
+from colmap_refract.commands.image_selector import ImageSelector
 from colmap_refract.commands.model_analyzer import ModelAnalyzer
 from colmap_refract.commands.refiner import Refiner
 from colmap_refract.errors import RefractError
@@ -41,10 +45,20 @@ def _registry() -> Any:
     return registry
 
 
-Command = (
-    Annotated[Refiner, tyro.conf.subcommand(name="refiner", prefix_name=False)]
-    | Annotated[ModelAnalyzer, tyro.conf.subcommand(name="model_analyzer", prefix_name=False)]
-)
+_COMMANDS = {
+    "camera_calibrator": CameraCalibrator,
+    "image_selector": ImageSelector,
+    "model_analyzer": ModelAnalyzer,
+    "refiner": Refiner,
+}
+
+
+def _union() -> Any:
+    """The commands as what tyro takes for subcommands."""
+    subcommands = (
+        Annotated[command, tyro.conf.subcommand(name=name, prefix_name=False)] for name, command in _COMMANDS.items()
+    )
+    return functools.reduce(operator.or_, subcommands)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -59,7 +73,7 @@ def main(arguments: list[str] | None = None) -> int:
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     try:
         command = tyro.cli(
-            Command,
+            _union(),
             prog="colmap-refract",
             description="Refraction-aware refinement of COLMAP models: scenes photographed through a plane interface.",
             args=arguments,

@@ -33,17 +33,32 @@ LAYERS = [
     {"refiner.observations", "refiner.alignment", "refiner.report"},
     {"refiner.start"},
     {"refiner.filtering", "refiner.uncertainty", "refiner.arrangement"},
+    {"refiner.averaging"},
     {"refiner.continuation", "refiner.advice"},
     {"refiner.selection"},
     {"refiner.outcome"},
     {"refiner.refinement"},
     {"__init__"},
+    {"photographs.images", "photographs.selection_options"},
+    {"photographs.frames", "photographs.selection", "photographs.frame_quality", "photographs.sparse_flow"},
+    {"photographs.video", "photographs.fixed_camera_frames", "photographs.moving_camera_frames"},
+    {"photographs.selection_report", "photographs.selection_plot"},
+    {"photographs.frame_selection", "photographs.selection_output"},
+    {"calibration.boards"},
+    {"calibration.adjustment", "calibration.search"},
+    {"calibration.calibration", "calibration.precision"},
+    {"calibration.coverage"},
+    {"calibration.picture"},
+    {"calibration.output"},
+    {"calibration.report"},
+    {"mapping.database", "mapping.completion"},
+    {"mapping.retriangulation"},
     {"simulation.least_path", "simulation.scene"},
     {"simulation.capture"},
     {"simulation.accuracy"},
     {"simulation"},
     {"commands.lists", "commands.progress"},
-    {"commands.model_analyzer", "commands.refiner"},
+    {"commands.camera_calibrator", "commands.image_selector", "commands.model_analyzer", "commands.refiner"},
     {"cli"},
 ]
 """A module imports from earlier layers only."""
@@ -54,10 +69,12 @@ SIMULATION_IMPORTS = {"errors", "interface", "options", "simulation"}
 LIBRARIES = {
     "numba": {"estimator"},
     "pyceres": {"estimator.adjustment"},
-    "pycolmap": {"files", "refiner.observations", "refiner.refinement", "refiner.outcome", "simulation"},
+    "pycolmap": {
+        "files", "refiner.observations", "refiner.refinement", "refiner.outcome", "simulation", "calibration", "mapping",
+    },
     "tyro": {"cli", "commands"},
-    "cv2": set(),
-}
+    "cv2": {"photographs", "calibration"},
+}  # fmt: skip
 """Which modules, or whole folders, may import a library at run time. For type checkers alone, everybody may."""
 
 HEAVY = ("numba", "pycolmap", "pyceres", "scipy", "cv2")

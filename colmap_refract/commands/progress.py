@@ -33,6 +33,10 @@ class ProgressLine:
             f"gradient {progress.gradient_max_norm:.2g}"
         )
 
+    def say(self, text: str) -> None:
+        """What is being done, in a few words."""
+        self._write(text)
+
     def _write(self, text: str) -> None:
         if self._shown:
             sys.stderr.write("\r" + text[:118].ljust(self._length))

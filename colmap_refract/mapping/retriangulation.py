@@ -227,22 +227,24 @@ def _write_tracks(
     image_id = observations.image_ids[keypoints.image].tolist()
     point2D_idx = keypoints.point2D_idx.tolist()
     num_before = len(observations.point3D_ids)
-    changed = np.flatnonzero(before != done.label)
-    for k in changed[before[changed] >= 0].tolist():
-        point3D_id = int(observations.point3D_ids[before[k]])
-        if model.exists_point3D(point3D_id):
-            # The last but one observation takes the point with it.
-            model.delete_observation(image_id[k], point2D_idx[k])
-    for k in changed[done.label[changed] >= 0].tolist():
-        if done.label[k] < num_before:
-            point3D_id = int(observations.point3D_ids[done.label[k]])
-            model.add_observation(point3D_id, pycolmap.TrackElement(image_id[k], point2D_idx[k]))
-    for p in np.flatnonzero(done.merged_into == np.arange(num_before)).tolist():
-        model.point3D(int(observations.point3D_ids[p])).xyz = done.points[p] * unit
+    changed = before != done.label
+    touched = np.unique(np.concatenate([before[changed], done.label[changed]]))
     order = np.argsort(done.label, kind="stable")
-    first = np.searchsorted(done.label[order], np.arange(num_before, len(done.points) + 1))
-    for p in range(num_before, len(done.points)):
-        rows = order[first[p - num_before] : first[p - num_before + 1]].tolist()
-        if rows:
-            track = pycolmap.Track([pycolmap.TrackElement(image_id[k], point2D_idx[k]) for k in rows])
-            model.add_point3D(done.points[p] * unit, track)
+    first = np.searchsorted(done.label[order], np.arange(len(done.points) + 1))
+    # All that change are taken out before any is put back, since keypoints go from one to another.
+    colors = {}
+    for p in touched[(touched >= 0) & (touched < num_before)].tolist():
+        point3D_id = int(observations.point3D_ids[p])
+        colors[p] = model.point3D(point3D_id).color.copy()
+        model.delete_point3D(point3D_id)
+    for p in touched[touched >= 0].tolist():
+        rows = order[first[p] : first[p + 1]].tolist()
+        if not rows:
+            continue
+        track = pycolmap.Track([pycolmap.TrackElement(image_id[k], point2D_idx[k]) for k in rows])
+        xyz = done.points[p] * unit
+        if p < num_before:
+            point = pycolmap.Point3D(xyz=xyz, color=colors[p], track=track)
+            model.add_point3D_with_id(int(observations.point3D_ids[p]), point)
+        else:
+            model.add_point3D(xyz, track)
