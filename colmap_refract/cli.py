@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import tyro
 
 from colmap_refract.commands.camera_calibrator import CameraCalibrator
+from colmap_refract.commands.flow_matcher import FlowMatcher
 from colmap_refract.commands.image_selector import ImageSelector
 from colmap_refract.commands.model_analyzer import ModelAnalyzer
 from colmap_refract.commands.refiner import Refiner
@@ -47,6 +48,7 @@ def _registry() -> Any:
 
 _COMMANDS = {
     "camera_calibrator": CameraCalibrator,
+    "flow_matcher": FlowMatcher,
     "image_selector": ImageSelector,
     "model_analyzer": ModelAnalyzer,
     "refiner": Refiner,

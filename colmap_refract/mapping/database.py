@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -79,12 +82,77 @@ def open_database(path: str | Path) -> Iterator[pycolmap.Database]:
         database.close()
 
 
+@contextmanager
+def read_database(path: str | Path) -> Iterator[pycolmap.Database]:
+    """A COLMAP database to read only: one that COLMAP would bring up to date, or cannot write to, stays as it is.
+
+    Of such a one a temporary copy is opened, without the descriptors, which are its bulk.
+
+    Raises:
+        RefractError: there is none at the path, it is none of COLMAP's, or there is no room for the copy.
+    """
+    path = Path(path)
+    check_database(path)
+    with ExitStack() as stack:
+        if _version(path) != _version_of_new() or not (os.access(path, os.W_OK) and os.access(path.parent, os.W_OK)):
+            folder = Path(stack.enter_context(TemporaryDirectory(prefix="colmap_refract-")))
+            path = _copy_without_descriptors(path, folder / "database.db")
+        yield stack.enter_context(open_database(path))
+
+
+def _read_only_uri(path: Path) -> str:
+    # Where SQLite cannot put its files for sharing beside a database, nobody else can be writing to it either.
+    shared = os.access(path.resolve().parent, os.W_OK)
+    return f"{path.resolve().as_uri()}?{'mode=ro' if shared else 'immutable=1'}"
+
+
+def _read_only(path: Path) -> sqlite3.Connection:
+    return sqlite3.connect(_read_only_uri(path), uri=True)
+
+
+def _version(path: Path) -> int:
+    with closing(_read_only(path)) as connection:
+        return int(connection.execute("PRAGMA user_version").fetchone()[0])
+
+
+@cache
+def _version_of_new() -> int:
+    """What COLMAP stamps a database with."""
+    import pycolmap
+
+    with TemporaryDirectory(prefix="colmap_refract-") as folder:
+        path = Path(folder) / "database.db"
+        pycolmap.Database.open(path).close()
+        return _version(path)
+
+
+def _copy_without_descriptors(source: Path, copy: Path) -> Path:
+    try:
+        with closing(sqlite3.connect(copy.as_uri(), uri=True)) as connection:
+            connection.execute("ATTACH ? AS source", (_read_only_uri(source),))
+            tables = connection.execute(
+                "SELECT name, sql FROM source.sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite_%'"
+            ).fetchall()
+            for name, sql in tables:
+                connection.execute(sql)
+                if name != "descriptors":
+                    connection.execute(f'INSERT INTO main."{name}" SELECT * FROM source."{name}"')
+            version = int(connection.execute("PRAGMA source.user_version").fetchone()[0])
+            connection.execute(f"PRAGMA main.user_version = {version}")
+            connection.commit()
+    except (sqlite3.Error, OSError) as error:
+        raise RefractError(
+            f"{source} cannot be copied to {copy.parent} to be read ({error}); make room there"
+        ) from None
+    return copy
+
+
 def check_database(path: Path) -> None:
     """Raise RefractError unless there is a COLMAP database at the path; it is not altered."""
     if not path.is_file():
         raise RefractError(f"{path} is no database file: give the database.db of a COLMAP project")
     try:
-        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as connection:
+        with closing(_read_only(path)) as connection:
             tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     except sqlite3.Error as error:
         raise RefractError(f"{path} cannot be read as a database ({error}); copy it again, or make a new one") from None
@@ -103,7 +171,7 @@ def read_correspondences(path: str | Path, *, verified: bool = True) -> Correspo
     Raises:
         RefractError: no database, no images or keypoints in it, or matches of keypoints that it does not have.
     """
-    with open_database(path) as database:
+    with read_database(path) as database:
         images = sorted(database.read_all_images(), key=lambda image: image.image_id)
         cameras = sorted(database.read_all_cameras(), key=lambda camera: camera.camera_id)
         if not images:
@@ -173,8 +241,9 @@ class Tracks:
 def build_tracks(correspondences: Correspondences) -> Tracks:
     """Keypoints that matches join, directly or through others, as far as no image is in a track twice.
 
-    A track that holds two keypoints of one image has a wrong match in it somewhere: those keypoints are left out,
-    and what is left of the track stays together.
+    What holds two keypoints of one image has a wrong match in it somewhere, and one can chain all points of a
+    scene together. There, matches are taken one by one, first those that most other keypoints bear out (by being
+    matched with both), and one that would bring two keypoints of an image into a track is not.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -185,13 +254,19 @@ def build_tracks(correspondences: Correspondences) -> Tracks:
         np.column_stack([first[i] + pair[:, 0], first[j] + pair[:, 1]])
         for (i, j), pair in zip(correspondences.pairs, correspondences.matches, strict=True)
     ]
-    a, b = np.concatenate([*ends, np.zeros((0, 2), dtype=np.int64)]).T
-    _, label = connected_components(coo_array((np.ones(len(a), dtype=np.int8), (a, b)), shape=(total, total)), False)
+    edges = np.concatenate([*ends, np.zeros((0, 2), dtype=np.int64)])
+    ones = np.ones(len(edges), dtype=np.int8)
+    _, label = connected_components(coo_array((ones, (edges[:, 0], edges[:, 1])), shape=(total, total)), False)
     image = np.repeat(np.arange(len(correspondences.keypoints)), np.diff(first))
     _, place, count = np.unique(label * len(first) + image, return_inverse=True, return_counts=True)
-    single = count[place] == 1
-    length = np.bincount(label[single], minlength=total)
-    rows = np.flatnonzero(single & (length[label] >= 2))
+    contradictory = np.zeros(total, dtype=np.bool_)
+    contradictory[label[count[place] > 1]] = True
+    members = np.flatnonzero(contradictory[label])
+    doubted = edges[contradictory[label[edges[:, 0]]]]
+    label = label.astype(np.int64)
+    label[members] = total + _join_cautiously(doubted, members, image[members])
+    length = np.bincount(label, minlength=total)
+    rows = np.flatnonzero(length[label] >= 2)
     rows = rows[np.argsort(label[rows], kind="stable")]
     _, lengths = np.unique(label[rows], return_counts=True)
     return Tracks(
@@ -199,6 +274,39 @@ def build_tracks(correspondences: Correspondences) -> Tracks:
         image=image[rows],
         point2D_idx=rows - first[image[rows]],
     )
+
+
+def _join_cautiously(edges: Index, members: Index, image: Index) -> Index:
+    """Label (M,) of M keypoints, each the position of one of its track, so that no image is in a track twice.
+
+    Args:
+        edges: (E, 2) matches between members.
+        members: (M,) keypoints counted through, ascending; image: (M,) of each.
+    """
+    from scipy.sparse import csr_array
+
+    count = len(members)
+    a, b = np.searchsorted(members, edges).T
+    adjacent = csr_array((np.ones(2 * len(a)), (np.concatenate([a, b]), np.concatenate([b, a]))), shape=(count, count))
+    borne_out = (adjacent @ adjacent).multiply(adjacent).tocsr()
+    support = np.asarray(borne_out[a, b]).ravel() if len(a) else np.zeros(0)
+    root = list(range(count))
+    images = [{i} for i in image.tolist()]
+
+    def find(k: int) -> int:
+        while root[k] != k:
+            root[k] = root[root[k]]
+            k = root[k]
+        return k
+
+    order = np.argsort(-support, kind="stable")
+    for i, j in zip(a[order].tolist(), b[order].tolist(), strict=True):
+        i, j = find(i), find(j)
+        if i != j and images[i].isdisjoint(images[j]):
+            i, j = (i, j) if len(images[i]) >= len(images[j]) else (j, i)
+            root[j] = i
+            images[i] |= images[j]
+    return np.array([find(k) for k in range(count)], dtype=np.int64)
 
 
 def write_tracks(
