@@ -54,24 +54,26 @@ class RefinerOptions:
     """How a model photographed through a plane interface is refined."""
 
     scenario: Scenario
-    """What is shared: moving_interface (nothing: each image has its own pose and plane),
-    static_interface (one plane, fixed in the world), fixed_camera (one pose, a plane per image),
-    camera_housing (one plane per camera, fixed in the camera)."""
+    """What is shared.
+    moving_interface: nothing, each image has its own pose and plane; static_interface: one plane,
+    fixed in the world; fixed_camera: one pose, a plane per image; camera_housing: one plane per
+    camera, fixed in the camera."""
 
     refractive_index: float = 1.333
     """Of the medium the scene is in, relative to the camera's. Fresh water 1.333, sea water 1.340."""
     layer_thickness: tuple[float, ...] = ()
-    """Thickness of each wall between camera and water, nearest the camera first; in metres if
-    interface_distance is given, otherwise in units of the model."""
+    """Thickness of each wall between camera and water, nearest the camera first.
+    In metres if interface_distance is given, otherwise in units of the model."""
     layer_refractive_index: tuple[float, ...] = ()
     """Refractive index of each wall. Glass 1.52, acrylic 1.49."""
 
     interface_distance: float | None = None
-    """Distance, in metres, of the reference image's projection centre from the interface. Makes the
-    result metric."""
+    """Distance, in metres, of the reference image's projection centre from the interface.
+    Makes the result metric."""
     interface_normal: tuple[float, float, float] | None = None
-    """Normal of the interface, from the camera into the water, in the camera's frame (of the reference
-    image, if the interface is fixed in the world). A start, unless refine_interface_normal is off."""
+    """Normal of the interface, from the camera into the water, in the camera's frame.
+    In that of the reference image, if the interface is fixed in the world. A start, unless
+    refine_interface_normal is off."""
     refine_interface_distance: bool = True
     """Off: every image's distance is held at interface_distance."""
     refine_interface_normal: bool = True
@@ -82,18 +84,18 @@ class RefinerOptions:
     """Refine the index of the water. Rarely determined by the data; the report says if it is not."""
 
     reference_image: str = ""
-    """Name of the image that interface_distance and interface_normal speak of, and whose pose a fixed
-    camera keeps. By default the one with most observations."""
+    """Name of the image that interface_distance and interface_normal speak of.
+    A fixed camera keeps its pose. By default the one with most observations."""
 
     average_groups: bool = False
-    """Average the keypoints of each interface group per track before solving, weighted by their
-    spread. For the frames of a fixed camera."""
+    """Average the keypoints of each interface group per track, weighted by their spread.
+    For the frames of a fixed camera."""
 
     filter_max_reproj_error: float = 4.0
     """Observations with a larger refractive reprojection error, px, are removed. 0: keep all."""
     filter_min_tri_angle: float | None = None
-    """Points whose refracted rays meet at a smaller angle, degrees, are removed. By default 0.5, and
-    0.05 with a fixed camera, whose rays differ by refraction only. 0: keep all."""
+    """Points whose refracted rays meet at a smaller angle, degrees, are removed.
+    By default 0.5, and 0.05 with a fixed camera, whose rays differ by refraction only. 0: keep all."""
 
     BundleAdjustment: BundleAdjustmentOptions = BundleAdjustmentOptions()
     num_threads: int = -1

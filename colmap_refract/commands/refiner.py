@@ -32,8 +32,9 @@ class Refiner:
     dry_image_list_path: Path | None = None
     """Text file with the name of an image per line that was taken without an interface."""
     database_path: Path | None = None
-    """COLMAP database of the model. With it, tracks that refraction cost are merged, completed and
-    triangulated from all its matches with refracted rays, and the model is refined again."""
+    """COLMAP database of the model, to get back the tracks that refraction cost.
+    They are merged, completed and triangulated from all its matches with refracted rays, and the
+    model is refined again."""
     overwrite: bool = False
     """Replace a model that is at output_path."""
 

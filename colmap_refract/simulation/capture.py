@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_refract.errors import RefractError
-from colmap_refract.interface import Array, Layers, plane_in_cam
+from colmap_refract.interface import Array, Layers, plane_in_world
 from colmap_refract.options import Scenario
 from colmap_refract.simulation import scene
 from colmap_refract.simulation.least_path import least_path_direction
-from colmap_refract.simulation.scene import Plane, SceneOptions
+from colmap_refract.simulation.scene import Plane, SceneOptions, Station
 
 if TYPE_CHECKING:
     import pycolmap
@@ -56,26 +55,18 @@ def simulate(options: SceneOptions) -> Capture:
         RefractError: options that contradict each other, or an interface that reaches behind a camera.
     """
     rng = np.random.default_rng(options.seed)
-    targets = scene.frame_targets(options, rng)
-    rotations, centers = scene.rig_poses(options, targets, rng)
-    points = scene.scene_points(options, targets, rng)
-    normals, offsets = scene.world_planes(options, targets, rng)
-    cameras, ports, sensors = scene.cameras(options), scene.ports(options), scene.sensors_from_rig(options)
+    plan = scene.lay_out(options, rng)
+    points, cameras, sensors = plan.points, scene.cameras(options), scene.sensors_from_rig(options)
 
     reach = 0.9 * np.hypot(*options.footprint)
     views = []
-    for frame, sensor in np.ndindex(len(targets), len(sensors)):
-        near = np.flatnonzero(np.linalg.norm(points[:, :2] - targets[frame], axis=1) < reach)
-        k = frame % options.num_cameras * len(sensors) + sensor
-        r = sensors[sensor][0] @ rotations[frame]
-        t = sensors[sensor][1] - r @ centers[frame]
-        housed = options.scenario == "camera_housing"
-        normal, distance = ports[k] if housed else plane_in_cam(normals[frame], float(offsets[frame]), r, t)
-        if distance <= 0:
-            raise RefractError("the interface reaches behind a camera: use less tilt_deg or more distance_ratio")
-        direction = least_path_direction(points[near] @ r.T + t, normal, distance, options.layers)
-        pixels, visible = _project(cameras[k], direction, margin=4 * options.pixel_noise)
-        views.append(_View(frame, sensor, cameras[k], r, t, (normal, distance), near[visible], pixels[visible]))
+    for station in plan.stations:
+        target = plan.targets[station.frame]
+        near = np.flatnonzero(np.linalg.norm(points[:, :2] - target, axis=1) < reach)
+        in_cam = points[near] @ station.rotation.T + station.translation
+        direction = least_path_direction(in_cam, *station.plane, options.layers)
+        pixels, visible = _project(station.camera, direction, margin=4 * options.pixel_noise)
+        views.append(_View(station, near[visible], pixels[visible]))
 
     num_seen = np.bincount(np.concatenate([view.seen for view in views]), minlength=len(points))
     outliers: set[tuple[int, int]] = set()
@@ -89,10 +80,10 @@ def simulate(options: SceneOptions) -> Capture:
     return Capture(
         options=options,
         reconstruction=_reconstruction(cameras, sensors, views, keypoints, points, num_seen > 1),
-        planes={image_id: view.plane for image_id, view in enumerate(views, start=1)},
+        planes={image_id: view.station.plane for image_id, view in enumerate(views, start=1)},
         pixels={image_id: view.pixels for image_id, view in enumerate(views, start=1)},
         outliers=outliers,
-        world_plane=(normals[0], float(offsets[0])) if options.scenario == "static_interface" else None,
+        world_plane=_world_plane(plan.stations[0]) if options.scenario == "static_interface" else None,
     )
 
 
@@ -148,16 +139,15 @@ def ignore_refraction(
 
 
 class _View(NamedTuple):
-    """One image: who took it, its pose and plane, the points it sees and their exact pixels (n, 2)."""
+    """One image: where it was taken from, the points it sees and their exact pixels (n, 2)."""
 
-    frame: int
-    sensor: int
-    camera: pycolmap.Camera
-    rotation: Array
-    translation: Array
-    plane: Plane
+    station: Station
     seen: NDArray[np.int64]
     pixels: Array
+
+
+def _world_plane(station: Station) -> Plane:
+    return plane_in_world(*station.plane, station.rotation, station.translation)
 
 
 def _project(camera: pycolmap.Camera, directions: Array, *, margin: float) -> tuple[Array, NDArray[np.int64]]:
@@ -191,17 +181,16 @@ def _reconstruction(
             rig.add_sensor(camera.sensor_id, pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation))
         model.add_rig(rig)
     for image_id, view in enumerate(views, start=1):
-        if view.sensor == 0:
-            pose = pycolmap.Rigid3d(pycolmap.Rotation3d(view.rotation), view.translation)
-            rig_id = 1 + (view.camera.camera_id - 1) // len(sensors)
-            frame = pycolmap.Frame(frame_id=view.frame + 1, rig_id=rig_id, rig_from_world=pose)
+        frame_number, sensor, camera, rotation, translation, _, name = view.station
+        if sensor == 0:
+            pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation)
+            rig_id = 1 + (camera.camera_id - 1) // len(sensors)
+            frame = pycolmap.Frame(frame_id=frame_number + 1, rig_id=rig_id, rig_from_world=pose)
             for k in range(len(sensors)):
-                frame.add_data_id(pycolmap.data_t(cameras[view.camera.camera_id - 1 + k].sensor_id, image_id + k))
+                frame.add_data_id(pycolmap.data_t(cameras[camera.camera_id - 1 + k].sensor_id, image_id + k))
             model.add_frame(frame)
-        folder = f"sensor{view.sensor + 1}/" if len(sensors) > 1 else ""
-        name = f"{folder}frame_{view.frame + 1:04d}.jpg"
-        image = pycolmap.Image(name, keypoints[image_id - 1], view.camera.camera_id, image_id)
-        image.frame_id = view.frame + 1
+        image = pycolmap.Image(name, keypoints[image_id - 1], camera.camera_id, image_id)
+        image.frame_id = frame_number + 1
         model.add_image(image)
     for frame_id in list(model.frames):
         model.register_frame(frame_id)

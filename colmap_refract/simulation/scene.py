@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
 from colmap_refract.errors import RefractError
-from colmap_refract.interface import Array, Layers, tangent_basis
+from colmap_refract.interface import Array, Layers, plane_in_cam, tangent_basis
 from colmap_refract.options import Scenario
 
 if TYPE_CHECKING:
@@ -39,6 +39,9 @@ class SceneOptions:
     height: int = 1200
     focal_length: float = 1200.0
     """In px. A narrow view is taken from farther away, so that it shows the same part of the scene."""
+    camera_params: tuple[float, ...] = ()
+    """All parameters of the camera model, as in COLMAP's camera files. Empty: `focal_length`, the principal point in
+    the middle, and a mild distortion. With them, `focal_length` is still what the scene's size goes by."""
     num_cameras: int = 1
     """Cameras (or rigs) that the frames alternate between."""
     sensors_per_frame: int = 1
@@ -49,6 +52,9 @@ class SceneOptions:
     """From the cameras down to the mean floor, metres. None: 2.5, or more for a narrow view."""
     distance_ratio: float | None = None
     """Interface distance over depth. None: 0.02 in a housing, otherwise what leaves 1.5 m of water."""
+    relief: float | None = None
+    """From the deepest to the highest place of the floor, metres. None: a quarter of `scene_size`, or less where the
+    water is shallow."""
     tilt_deg: float = 5.0
     """Root mean square tilt of moving interfaces from level, or the tilt of the ports in their housings."""
     frames_per_interface: int = 1
@@ -66,6 +72,12 @@ class SceneOptions:
             raise RefractError("fixed_camera has one camera: leave num_cameras and sensors_per_frame at 1")
         if self.scenario == "camera_housing" and self.dry_point_ratio > 0:
             raise RefractError("camera_housing has no dry points: leave dry_point_ratio at 0")
+        if self.camera_params and self.num_cameras * self.sensors_per_frame > 1:
+            raise RefractError("camera_params are those of one camera: leave num_cameras and sensors_per_frame at 1")
+        if self.relief is not None and not 0 <= self.relief < 2 * (self.camera_height - self.interface_height):
+            raise RefractError(
+                f"a relief of {self.relief:g} m reaches out of the water: give less than twice its depth"
+            )
 
     @property
     def camera_height(self) -> float:
@@ -93,6 +105,26 @@ class SceneOptions:
         sine = np.minimum(tangent / np.hypot(1, tangent) / self.layers.refractive_index, 0.95)
         water = self.camera_height - self.interface_height
         return np.asarray(2 * (self.interface_height * tangent + water * sine / np.sqrt(1 - sine**2)))
+
+
+class Station(NamedTuple):
+    """Where one image is taken from: frame and sensor from 0, pose, and plane `(normal_in_cam, distance)`."""
+
+    frame: int
+    sensor: int
+    camera: pycolmap.Camera
+    rotation: Array
+    translation: Array
+    plane: Plane
+    name: str
+
+
+class Arrangement(NamedTuple):
+    """A capture before anything is photographed: targets (F, 2) of the frames, points (P, 3), and the stations."""
+
+    targets: Array
+    points: Array
+    stations: list[Station]
 
 
 def frame_targets(options: SceneOptions, rng: np.random.Generator) -> Array:
@@ -141,6 +173,10 @@ def cameras(options: SceneOptions) -> list[pycolmap.Camera]:
         camera = pycolmap.Camera.create_from_model_name(
             k + 1, options.camera_model, focal_length, options.width, options.height
         )
+        if options.camera_params:
+            camera.params = list(options.camera_params)
+            cameras.append(camera)
+            continue
         for idx in camera.extra_params_idxs()[:1]:
             # The field-of-view model has no undistorted state and comes with a value already.
             camera.params[idx] = camera.params[idx] or (0.1 if options.camera_model == "EUCM" else -0.02)
@@ -168,7 +204,7 @@ def scene_points(options: SceneOptions, targets: Array, rng: np.random.Generator
         wave = rng.normal(size=2) * 4 / options.scene_size
         hills += np.sin(xy @ wave + rng.uniform(0, 2 * np.pi))
     water = options.camera_height - options.interface_height
-    relief = min(0.25 * options.scene_size, 0.7 * water)
+    relief = options.relief if options.relief is not None else min(0.25 * options.scene_size, 0.7 * water)
     hills = (hills - hills.min()) / max(np.ptp(hills), 1e-12) - 0.5
     z = options.camera_height + relief * (0.7 * hills + 0.3 * rng.uniform(-0.5, 0.5, options.num_points))
     pier = np.argsort(abs(xy[:, 0] - 0.5 * (low + high)[0]))[: round(options.dry_point_ratio * options.num_points)]
@@ -198,6 +234,31 @@ def ports(options: SceneOptions) -> list[Plane]:
     normals = np.stack([slope * np.cos(azimuth), slope * np.sin(azimuth), np.ones(len(k))], axis=1)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return list(zip(normals, (options.interface_height * (1 + 0.2 * k)).tolist(), strict=True))
+
+
+def lay_out(options: SceneOptions, rng: np.random.Generator) -> Arrangement:
+    """Everything that stands somewhere; images by frame, then by sensor.
+
+    Raises:
+        RefractError: an interface that reaches behind a camera.
+    """
+    targets = frame_targets(options, rng)
+    rotations, centers = rig_poses(options, targets, rng)
+    points = scene_points(options, targets, rng)
+    normals, offsets = world_planes(options, targets, rng)
+    every_camera, every_port, sensors = cameras(options), ports(options), sensors_from_rig(options)
+    stations = []
+    for frame, sensor in np.ndindex(len(targets), len(sensors)):
+        k = frame % options.num_cameras * len(sensors) + sensor
+        r = sensors[sensor][0] @ rotations[frame]
+        t = sensors[sensor][1] - r @ centers[frame]
+        housed = options.scenario == "camera_housing"
+        plane = every_port[k] if housed else plane_in_cam(normals[frame], float(offsets[frame]), r, t)
+        if plane[1] <= 0:
+            raise RefractError("the interface reaches behind a camera: use less tilt_deg or more distance_ratio")
+        folder = f"sensor{sensor + 1}/" if len(sensors) > 1 else ""
+        stations.append(Station(frame, sensor, every_camera[k], r, t, plane, f"{folder}frame_{frame + 1:04d}.jpg"))
+    return Arrangement(targets, points, stations)
 
 
 def _largest_slope(options: SceneOptions) -> float:
