@@ -15,6 +15,7 @@ from colmap_refract.commands.flow_matcher import FlowMatcher
 from colmap_refract.commands.image_selector import ImageSelector
 from colmap_refract.commands.model_analyzer import ModelAnalyzer
 from colmap_refract.commands.refiner import Refiner
+from colmap_refract.commands.simulator import Simulator
 from colmap_refract.errors import RefractError
 
 _INTERRUPTED = 130
@@ -52,6 +53,7 @@ _COMMANDS = {
     "image_selector": ImageSelector,
     "model_analyzer": ModelAnalyzer,
     "refiner": Refiner,
+    "simulator": Simulator,
 }
 
 

@@ -59,9 +59,13 @@ LAYERS = [
     {"calibration.report"},
     {"mapping.database", "mapping.completion"},
     {"mapping.retriangulation", "mapping.flow_database"},
-    {"simulation.least_path", "simulation.scene"},
-    {"simulation.capture"},
-    {"simulation.accuracy"},
+    {"simulation.least_path", "simulation.scene", "simulation.surface", "simulation.ray_tracing", "simulation.stones"},
+    {"simulation.capture", "simulation.precision", "simulation.terrain", "simulation.texture", "simulation.painting"},
+    {"simulation.accuracy", "simulation.view"},
+    {"simulation.rendering", "simulation.truth"},
+    {"simulation.session", "simulation.judge"},
+    {"simulation.plan"},
+    {"simulation.plan_report"},
     {"simulation"},
     {"commands.lists", "commands.progress"},
     {
@@ -79,7 +83,7 @@ SIMULATION_IMPORTS = {"errors", "interface", "options", "simulation"}
 """The simulation stands beside the layers: with the solver's optics, an error there would be in the truth, too."""
 
 LIBRARIES = {
-    "numba": {"estimator"},
+    "numba": {"estimator", "simulation.ray_tracing", "simulation.painting", "simulation.stones"},
     "pyceres": {"estimator.adjustment"},
     "pycolmap": {
         "files", "refiner.observations", "refiner.refinement", "refiner.outcome", "simulation", "calibration", "mapping",
