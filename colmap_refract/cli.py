@@ -10,9 +10,11 @@ from typing import Annotated, Any
 
 import tyro
 
+from colmap_refract.commands.automatic_reconstructor import AutomaticReconstructor
 from colmap_refract.commands.camera_calibrator import CameraCalibrator
 from colmap_refract.commands.flow_matcher import FlowMatcher
 from colmap_refract.commands.image_selector import ImageSelector
+from colmap_refract.commands.initial_mapper import InitialMapper
 from colmap_refract.commands.model_analyzer import ModelAnalyzer
 from colmap_refract.commands.refiner import Refiner
 from colmap_refract.commands.simulator import Simulator
@@ -48,9 +50,11 @@ def _registry() -> Any:
 
 
 _COMMANDS = {
+    "automatic_reconstructor": AutomaticReconstructor,
     "camera_calibrator": CameraCalibrator,
     "flow_matcher": FlowMatcher,
     "image_selector": ImageSelector,
+    "initial_mapper": InitialMapper,
     "model_analyzer": ModelAnalyzer,
     "refiner": Refiner,
     "simulator": Simulator,
@@ -89,8 +93,8 @@ def main(arguments: list[str] | None = None) -> int:
     except RefractError as error:
         print(f"ERROR: {error}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
-        print("\nInterrupted: nothing was written.", file=sys.stderr)
+    except KeyboardInterrupt as interrupt:
+        print(f"\n{interrupt}" if interrupt.args else "\nInterrupted: nothing was written.", file=sys.stderr)
         return _INTERRUPTED
     return 0
 

@@ -15,13 +15,13 @@ import pytest
 from numpy.typing import NDArray
 
 from colmap_refract.errors import RefractError
-from colmap_refract.photographs.flow import FlowTracks, track_against_reference
-from colmap_refract.photographs.flow_estimate import affine_start
-from colmap_refract.photographs.flow_field import fit_field
-from colmap_refract.photographs.flow_frame import MIN_TRACKS, track_frame
-from colmap_refract.photographs.flow_options import FlowMethod, FlowOptions
-from colmap_refract.photographs.flow_pictures import correlation, level, match_sharpness
-from colmap_refract.photographs.flow_reference import choose_reference, find_corners
+from colmap_refract.optical_flow.estimate import affine_start
+from colmap_refract.optical_flow.field import fit_field
+from colmap_refract.optical_flow.frame import MIN_TRACKS, track_frame
+from colmap_refract.optical_flow.options import FlowMethod, FlowOptions
+from colmap_refract.optical_flow.pictures import correlation, level, match_sharpness
+from colmap_refract.optical_flow.reference import choose_reference, find_corners
+from colmap_refract.optical_flow.tracking import FlowTracks, track_against_reference
 
 Gray = NDArray[np.uint8]
 Array = NDArray[np.float64]

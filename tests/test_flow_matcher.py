@@ -21,9 +21,9 @@ from colmap_refract.errors import RefractError
 from colmap_refract.mapping import flow_database
 from colmap_refract.mapping.database import build_tracks, read_correspondences
 from colmap_refract.mapping.flow_database import create_flow_database
-from colmap_refract.photographs.flow import FlowTracks
-from colmap_refract.photographs.flow_frame import FrameFlow
-from colmap_refract.photographs.flow_options import FlowOptions
+from colmap_refract.optical_flow.frame import FrameFlow
+from colmap_refract.optical_flow.options import FlowOptions
+from colmap_refract.optical_flow.tracking import FlowTracks
 
 WIDTH, HEIGHT = 240, 180
 SHIFTS = {"a/left.png": (-7, 2), "a/middle.png": (0, 0), "b/right.png": (6, 3), "b/right2.png": (9, -4)}

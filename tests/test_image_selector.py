@@ -23,13 +23,13 @@ from numpy.typing import NDArray
 
 from colmap_refract.commands.image_selector import ImageSelector
 from colmap_refract.errors import RefractError
-from colmap_refract.photographs import frame_selection
-from colmap_refract.photographs.frame_selection import select_frames
+from colmap_refract.frame_selection import choice
+from colmap_refract.frame_selection.choice import select_frames
+from colmap_refract.frame_selection.options import SelectionOptions
+from colmap_refract.frame_selection.report import report, to_json
+from colmap_refract.frame_selection.selection import Selection
 from colmap_refract.photographs.frames import ImageFolder
 from colmap_refract.photographs.images import read_gray
-from colmap_refract.photographs.selection import Selection
-from colmap_refract.photographs.selection_options import SelectionOptions
-from colmap_refract.photographs.selection_report import report, to_json
 from colmap_refract.photographs.video import Video
 
 WIDTH, HEIGHT = 240, 180
@@ -377,7 +377,7 @@ def test_step(fixed: Sequence) -> None:
 def test_only_so_many_frames_are_looked_at_by_default(fixed: Sequence, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(frame_selection, "_MOST_FRAMES", 10)
     options = SelectionOptions(scenario="fixed_camera", num_images=3)
-    selection = frame_selection.select_frames(ImageFolder(fixed.folder), options)
+    selection = choice.select_frames(ImageFolder(fixed.folder), options)
     assert [frame.index for frame in selection.frames] == list(range(0, NUM_FRAMES, 4))
     assert selection.frame_step == 4
 

@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from colmap_refract.commands.progress import ProgressLine
-from colmap_refract.photographs.flow_options import FlowOptions
+from colmap_refract.optical_flow.options import FlowOptions
 
 logger = logging.getLogger(__name__)
 
@@ -37,8 +37,8 @@ class FlowMatcher:
         """Look, track, write, report."""
         from colmap_refract.files.cameras_file import read_cameras
         from colmap_refract.mapping.flow_database import calibrated_camera, check_new_database, create_flow_database
-        from colmap_refract.photographs.flow import check_names, choose_reference, track_against_reference
-        from colmap_refract.photographs.flow_report import flow_report
+        from colmap_refract.optical_flow.report import flow_report
+        from colmap_refract.optical_flow.tracking import check_names, choose_reference, track_against_reference
         from colmap_refract.photographs.images import Gray, image_size, list_images, read_gray
 
         def read(name: str) -> Gray:

@@ -11,7 +11,7 @@ import tyro
 
 from colmap_refract.commands.progress import ProgressLine
 from colmap_refract.errors import RefractError
-from colmap_refract.photographs.selection_options import SelectionOptions
+from colmap_refract.frame_selection.options import SelectionOptions
 
 if TYPE_CHECKING:
     from colmap_refract.photographs.frames import FrameSource
@@ -47,9 +47,9 @@ class ImageSelector:
             raise RefractError("give either --image_path, a folder of images, or --video_path")
         if self.image_path is not None and (self.start_time != 0 or self.end_time is not None):
             raise RefractError("--start_time and --end_time are of a video; images have no time")
-        from colmap_refract.photographs.frame_selection import select_frames
-        from colmap_refract.photographs.selection_output import selection_folder, write_selection
-        from colmap_refract.photographs.selection_report import report
+        from colmap_refract.frame_selection.choice import select_frames
+        from colmap_refract.frame_selection.output import selection_folder, write_selection
+        from colmap_refract.frame_selection.report import report
 
         source = self._source()
         with ExitStack() as stack:

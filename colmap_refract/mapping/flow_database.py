@@ -17,7 +17,7 @@ from colmap_refract.mapping.database import open_database, write_tracks
 if TYPE_CHECKING:
     import pycolmap
 
-    from colmap_refract.photographs.flow import FlowTracks
+    from colmap_refract.optical_flow.tracking import FlowTracks
 
 _SIDE_FILES = ("", "-journal", "-wal", "-shm")
 """What SQLite may keep beside a database, and itself."""
@@ -67,7 +67,7 @@ def create_flow_database(
         names: of all images, relative to the folder; those without tracks are in the database, too.
         camera: calibrated in air; it then counts as known beforehand. Otherwise COLMAP's guess, from EXIF or the
             size of the images.
-        tracks: of `photographs.flow`; the matches count as verified.
+        tracks: of `optical_flow.tracking`; the matches count as verified.
 
     Raises:
         RefractError: there is something at the path, it cannot be written to, or COLMAP cannot read an image.

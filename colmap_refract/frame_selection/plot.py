@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_refract.frame_selection.selection import FrameRecord, Selection
 from colmap_refract.interface import Array
-from colmap_refract.photographs.selection import FrameRecord, Selection
 
 _WIDTH, _HEIGHT = 1000, 800
 _LEFT, _RIGHT, _TOP, _BOTTOM = 90, 30, 50, 80

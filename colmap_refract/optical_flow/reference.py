@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 
 from colmap_refract.errors import RefractError
+from colmap_refract.frame_selection.fixed_camera import choose
+from colmap_refract.frame_selection.quality import grade, measure, shrink
 from colmap_refract.interface import Array
-from colmap_refract.photographs.fixed_camera_frames import choose
-from colmap_refract.photographs.flow_options import FlowOptions
-from colmap_refract.photographs.flow_pictures import level
-from colmap_refract.photographs.frame_quality import grade, measure, shrink
+from colmap_refract.optical_flow.options import FlowOptions
+from colmap_refract.optical_flow.pictures import level
 from colmap_refract.photographs.images import Gray, common_size
 
 Read = Callable[[str], Gray]

@@ -20,9 +20,9 @@ import numpy as np
 
 from colmap_refract.errors import RefractError
 from colmap_refract.interface import Array
-from colmap_refract.photographs.flow_frame import MIN_TRACKS, FrameFlow, Index, track_frame
-from colmap_refract.photographs.flow_options import FlowOptions
-from colmap_refract.photographs.flow_reference import (
+from colmap_refract.optical_flow.frame import MIN_TRACKS, FrameFlow, Index, track_frame
+from colmap_refract.optical_flow.options import FlowOptions
+from colmap_refract.optical_flow.reference import (
     Read,
     Watch,
     check_names,

@@ -12,9 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from colmap_refract.interface import Array
-from colmap_refract.photographs.images import Gray
-from colmap_refract.photographs.sparse_flow import (
+from colmap_refract.frame_selection.sparse_flow import (
     AffineField,
     affine_field,
     corners,
@@ -23,6 +21,8 @@ from colmap_refract.photographs.sparse_flow import (
     track,
     tracked_fraction,
 )
+from colmap_refract.interface import Array
+from colmap_refract.photographs.images import Gray
 
 MIN_TRACKED = 0.4
 """Of the reference's points; a frame in which fewer are found has lost the track."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from colmap_refract.photographs.flow import FlowTracks
+from colmap_refract.optical_flow.tracking import FlowTracks
 
 _WIDTH = 78
 

@@ -15,13 +15,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from colmap_refract.errors import RefractError
+from colmap_refract.frame_selection import fixed_camera, moving_camera
+from colmap_refract.frame_selection.options import SelectionOptions
+from colmap_refract.frame_selection.quality import Grades, Quality, grade, measure, shrink
+from colmap_refract.frame_selection.selection import FrameRecord, Selection, Verdict
 from colmap_refract.interface import Array
-from colmap_refract.photographs import fixed_camera_frames, moving_camera_frames
-from colmap_refract.photographs.frame_quality import Grades, Quality, grade, measure, shrink
 from colmap_refract.photographs.frames import Frame, FrameSource
 from colmap_refract.photographs.images import Gray, common_size
-from colmap_refract.photographs.selection import FrameRecord, Selection, Verdict
-from colmap_refract.photographs.selection_options import SelectionOptions
 
 _MOST_FRAMES = 600  # that are looked at by default: a minute, and 200 MB of small copies
 _NEIGHBOURS = 15  # that a frame of a moving camera is compared with, on either side
@@ -179,7 +179,7 @@ def _look(source: FrameSource, options: SelectionOptions, step: int, watch: Call
 def _fixed_camera(
     looked: _Looked, options: SelectionOptions, watch: Callable[[str], None]
 ) -> tuple[list[FrameRecord], list[str]]:
-    choice = fixed_camera_frames.choose(
+    choice = fixed_camera.choose(
         looked.usable_smalls,
         looked.usable_grades,
         num_images=options.num_images,
@@ -230,14 +230,12 @@ def _moving_camera(
     looked: _Looked, options: SelectionOptions, watch: Callable[[str], None]
 ) -> tuple[list[FrameRecord], list[str]]:
     scale, records, grades = looked.scale, list(looked.records), looked.usable_grades
-    path = moving_camera_frames.flow_path(looked.usable_smalls, watch)
+    path = moving_camera.flow_path(looked.usable_smalls, watch)
     warnings = []
     if looked.reference is not None and np.isnan(path.positions[looked.reference]):
         path = path.filled(looked.reference)
         warnings.append(f"the reference {options.reference_image} has nothing in common with the frames around it")
-    chosen = moving_camera_frames.choose(
-        path, grades, looked.side, num_images=options.num_images, reference=looked.reference
-    )
+    chosen = moving_camera.choose(path, grades, looked.side, num_images=options.num_images, reference=looked.reference)
     reference = looked.reference
     if reference is None:
         reference = max(chosen, key=lambda k: records[looked.usable[k]].num_features)
@@ -266,7 +264,7 @@ def _moving_camera(
     return records, [*warnings, *_path_warnings(looked, path, chosen)]
 
 
-def _path_warnings(looked: _Looked, path: moving_camera_frames.FlowPath, chosen: list[int]) -> list[str]:
+def _path_warnings(looked: _Looked, path: moving_camera.FlowPath, chosen: list[int]) -> list[str]:
     names = [looked.records[place].name for place in looked.usable]
     warnings, side = [], looked.side
     if path.breaks:
@@ -276,8 +274,8 @@ def _path_warnings(looked: _Looked, path: moving_camera_frames.FlowPath, chosen:
             "a cut, or too long a way between frames"
         )
     most = float(np.nanmax(np.diff(path.positions[chosen]), initial=0.0))
-    if most > moving_camera_frames.MAX_STEP * side:
-        enough = math.ceil(path.length / (moving_camera_frames.MAX_STEP / 2 * side)) + 1
+    if most > moving_camera.MAX_STEP * side:
+        enough = math.ceil(path.length / (moving_camera.MAX_STEP / 2 * side)) + 1
         warnings.append(
             f"neighbours are up to {looked.scale * most:.0f} px apart, {100 * most / side:.0f} % of the picture, and "
             f"may overlap too little to be matched; about {enough} images would do (num_images)"

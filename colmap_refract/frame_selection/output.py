@@ -22,10 +22,10 @@ import cv2
 
 from colmap_refract.errors import RefractError
 from colmap_refract.files.output import WORK_PREFIX, output_folder
+from colmap_refract.frame_selection.plot import plot
+from colmap_refract.frame_selection.report import FORMAT, to_json
+from colmap_refract.frame_selection.selection import Selection
 from colmap_refract.photographs.frames import FrameSource
-from colmap_refract.photographs.selection import Selection
-from colmap_refract.photographs.selection_plot import plot
-from colmap_refract.photographs.selection_report import FORMAT, to_json
 
 IMAGES, LIST, FIGURES, PLOT = "images", "image_list.txt", "selection.json", "selection.png"
 OLD = "old"

@@ -7,7 +7,7 @@ import json
 
 import numpy as np
 
-from colmap_refract.photographs.selection import FrameRecord, Selection
+from colmap_refract.frame_selection.selection import FrameRecord, Selection
 
 FORMAT = "colmap_refract selection"
 VERSION = 1

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_refract.interface import Array
-from colmap_refract.photographs.flow_estimate import affine_start, estimate, lucas_kanade
-from colmap_refract.photographs.flow_field import fit_field
-from colmap_refract.photographs.flow_options import FlowOptions
-from colmap_refract.photographs.flow_pictures import correlation, level, match_sharpness
+from colmap_refract.optical_flow.estimate import affine_start, estimate, lucas_kanade
+from colmap_refract.optical_flow.field import fit_field
+from colmap_refract.optical_flow.options import FlowOptions
+from colmap_refract.optical_flow.pictures import correlation, level, match_sharpness
 from colmap_refract.photographs.images import Gray
 
 Index = NDArray[np.int64]

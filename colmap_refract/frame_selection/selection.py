@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from colmap_refract.photographs.selection_options import SelectionOptions
+from colmap_refract.frame_selection.options import SelectionOptions
 
 Verdict = Literal["reference", "chosen", "blurred", "few features", "lost track", "too similar"]
 

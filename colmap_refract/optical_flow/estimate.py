@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_refract.interface import Array
-from colmap_refract.photographs.flow_field import Field
-from colmap_refract.photographs.flow_options import FlowMethod
+from colmap_refract.optical_flow.field import Field
+from colmap_refract.optical_flow.options import FlowMethod
 from colmap_refract.photographs.images import Gray
 
 _COARSE_SIDE = 192  # pixels of the copies that the affine start is sought in, where waves and blur are small

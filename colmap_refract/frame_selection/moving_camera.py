@@ -7,9 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from colmap_refract.interface import Array
-from colmap_refract.photographs.images import Gray
-from colmap_refract.photographs.sparse_flow import (
+from colmap_refract.frame_selection.sparse_flow import (
     Points,
     corners,
     flatten,
@@ -18,6 +16,8 @@ from colmap_refract.photographs.sparse_flow import (
     track,
     tracked_fraction,
 )
+from colmap_refract.interface import Array
+from colmap_refract.photographs.images import Gray
 
 MAX_STEP = 0.25
 """Of the longest side; beyond, neighbours overlap too little to be matched well."""

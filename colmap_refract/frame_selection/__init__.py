@@ -1,0 +1,1 @@
+"""Which frames to take, and which as the reference: sharp, rich in features, and unlike each other."""
