@@ -375,7 +375,7 @@ def test_step(fixed: Sequence) -> None:
 
 
 def test_only_so_many_frames_are_looked_at_by_default(fixed: Sequence, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frame_selection, "_MOST_FRAMES", 10)
+    monkeypatch.setattr(choice, "_MOST_FRAMES", 10)
     options = SelectionOptions(scenario="fixed_camera", num_images=3)
     selection = choice.select_frames(ImageFolder(fixed.folder), options)
     assert [frame.index for frame in selection.frames] == list(range(0, NUM_FRAMES, 4))
