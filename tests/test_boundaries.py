@@ -19,9 +19,9 @@ PACKAGE = Path(colmap_refract.__file__).parent
 
 LAYERS = [
     {"errors"},
-    {"interface"},
+    {"interface", "machine"},
     {"options"},
-    {"files.model_files"},
+    {"files.model_files", "files.quiet"},
     {"files.text_files", "files.binary_files", "files.sidecar"},
     {"files.cameras_file", "files.output"},
     {"files.model_io"},
@@ -41,7 +41,10 @@ LAYERS = [
     {"__init__"},
     {"photographs.images", "frame_selection.options"},
     {"photographs.frames", "frame_selection.selection", "frame_selection.quality", "frame_selection.sparse_flow"},
-    {"photographs.video", "frame_selection.fixed_camera", "frame_selection.moving_camera"},
+    {
+        "photographs.video", "frame_selection.fixed_camera", "frame_selection.looking",
+        "frame_selection.moving_camera",
+    },
     {"frame_selection.report", "frame_selection.plot"},
     {"frame_selection.choice", "frame_selection.output"},
     {"optical_flow.options"},
@@ -57,8 +60,9 @@ LAYERS = [
     {"calibration.picture"},
     {"calibration.output"},
     {"calibration.report"},
-    {"mapping.database", "mapping.completion"},
-    {"mapping.retriangulation", "mapping.flow_database"},
+    {"mapping.database", "mapping.known_views"},
+    {"mapping.completion", "mapping.flow_database", "mapping.tracks"},
+    {"mapping.retriangulation"},
     {"mapping.model_from_database", "mapping.pairs", "mapping.dry_adjustment"},
     {"mapping.clouds", "mapping.registration"},
     {"mapping.fixed_camera", "mapping.moving_camera"},
@@ -75,7 +79,10 @@ LAYERS = [
     {"reconstructor.refined"},
     {"reconstructor.pipeline"},
     {"simulation.least_path", "simulation.scene", "simulation.surface", "simulation.ray_tracing", "simulation.stones"},
-    {"simulation.capture", "simulation.precision", "simulation.terrain", "simulation.texture", "simulation.painting"},
+    {
+        "simulation.capture", "simulation.database", "simulation.precision", "simulation.terrain", "simulation.texture",
+        "simulation.painting",
+    },
     {"simulation.accuracy", "simulation.view"},
     {"simulation.rendering", "simulation.truth"},
     {"simulation.session", "simulation.judge"},
@@ -92,7 +99,7 @@ LAYERS = [
 ]  # fmt: skip
 """A module imports from earlier layers only."""
 
-SIMULATION_IMPORTS = {"errors", "interface", "options", "simulation"}
+SIMULATION_IMPORTS = {"errors", "interface", "machine", "options", "simulation"}
 """The simulation stands beside the layers: with the solver's optics, an error there would be in the truth, too."""
 
 LIBRARIES = {

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
-from capture_database import MAX_IMAGES, write_colmap_3_database, write_database
+from capture_database import MAX_IMAGES, write_colmap_3_database
 from conftest import Scenes
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -20,13 +20,13 @@ from hypothesis import strategies as st
 from colmap_refract.errors import RefractError
 from colmap_refract.mapping.database import (
     Correspondences,
-    Tracks,
-    build_tracks,
     check_database,
     read_correspondences,
     write_tracks,
 )
 from colmap_refract.mapping.model_from_database import read_unposed_model
+from colmap_refract.mapping.tracks import Tracks, build_tracks
+from colmap_refract.simulation.database import write_database
 
 NAMES = ["b/late.png", "a.jpg", "c.jpg"]
 

@@ -10,20 +10,22 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
-from capture_database import write_colmap_3_database, write_database
+from capture_database import write_colmap_3_database
 from conftest import Scene, Scenes
 from scipy.stats import spearmanr
 
 from colmap_refract.errors import RefractError
 from colmap_refract.interface import Array, Layers
 from colmap_refract.mapping.clouds import average_clouds, pair_cloud, weighted_medians
-from colmap_refract.mapping.database import build_tracks, read_correspondences
+from colmap_refract.mapping.database import read_correspondences
 from colmap_refract.mapping.fixed_camera import find_relief
 from colmap_refract.mapping.initial import InitialModel, initial_model, initial_model_from_database
 from colmap_refract.mapping.model_from_database import observations_of_tracks, read_unposed_model
 from colmap_refract.mapping.pairs import common_points, connected_groups, rank_pairs, rotational_residual
+from colmap_refract.mapping.tracks import build_tracks
 from colmap_refract.refiner.observations import Observations
 from colmap_refract.simulation import point_rmse
+from colmap_refract.simulation.database import write_database
 
 DRY = Layers(index=(1.0001,))
 """As good as no water: what is found of such a scene must be the truth, but for 1e-4 of it."""
@@ -79,15 +81,12 @@ def observed(scene: Scene, folder: Path) -> tuple[Observations, Array]:
         ("static_interface", {"seed": 0}),
         ("static_interface", {"seed": 1, "outlier_ratio": 0.05}),
         ("moving_interface", {"seed": 0}),
-        ("moving_interface", {"seed": 1}),
         ("camera_housing", {"seed": 0}),
         ("camera_housing", {"seed": 1, "num_cameras": 2}),
         ("fixed_camera", {"seed": 4, "tilt_deg": 1.5}),
-        ("fixed_camera", {"seed": 5, "tilt_deg": 1.5}),
         ("fixed_camera", {"seed": 1, "tilt_deg": 3.0}),
         ("fixed_camera", {"seed": 4, "tilt_deg": 3.0, "outlier_ratio": 0.05}),
         ("fixed_camera", {"seed": 1, "tilt_deg": 8.0}),
-        ("fixed_camera", {"seed": 3, "tilt_deg": 8.0}),
     ],
 )
 def test_refining_the_start_reaches_the_noise_bound(

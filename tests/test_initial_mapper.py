@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
-from capture_database import write_database
 from conftest import Scene, Scenes
 
 from colmap_refract.commands.initial_mapper import InitialMapper
@@ -19,6 +18,7 @@ from colmap_refract.errors import RefractError
 from colmap_refract.files.model_io import read_model
 from colmap_refract.options import RefinerOptions
 from colmap_refract.simulation import Capture
+from colmap_refract.simulation.database import write_database
 
 
 @pytest.fixture
