@@ -1,16 +1,18 @@
-"""Captures that many tests look at, simulated and solved once."""
+"""Captures that many tests look at, simulated and solved once, and how tests look at errors and files."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
 import pytest
 
+from colmap_refract.errors import RefractError
 from colmap_refract.interface import Array
 from colmap_refract.options import RefinerOptions, Scenario
 from colmap_refract.refiner.refinement import Refinement, refine
@@ -69,6 +71,20 @@ class Scenes:
 @pytest.fixture(scope="session")
 def scenes() -> Scenes:
     return Scenes()
+
+
+def error_of(call: Callable[[], object]) -> str:
+    """The one line of the error that a call must end with."""
+    with pytest.raises(RefractError) as caught:
+        call()
+    message = str(caught.value)
+    assert message and "\n" not in message
+    return message
+
+
+def snapshot(folder: Path) -> dict[str, bytes]:
+    """Every file below a folder, hidden ones included."""
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 def centers_of(reconstruction: pycolmap.Reconstruction) -> Array:

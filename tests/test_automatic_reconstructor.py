@@ -369,12 +369,14 @@ def test_interrupted_stages_go_on(pictures: Path, tmp_path: Path, finished: tupl
 
 
 CODE = """
+import signal
 import sys
 from pathlib import Path
 from colmap_refract.commands.automatic_reconstructor import AutomaticReconstructor
 from colmap_refract.errors import RefractError
 from colmap_refract.options import RefinerOptions
 from colmap_refract.reconstructor.options import ReconstructorOptions
+signal.signal(signal.SIGINT, signal.default_int_handler)  # which what is started in the background may lack
 try:
     AutomaticReconstructor(
         workspace_path=Path(sys.argv[1]), image_path=Path(sys.argv[2]) / "images",

@@ -2,24 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import pycolmap
 import pytest
+from conftest import error_of
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from colmap_refract.errors import RefractError
 from colmap_refract.files.cameras_file import read_cameras
-
-
-def error_of(call: Callable[[], object]) -> str:
-    with pytest.raises(RefractError) as caught:
-        call()
-    message = str(caught.value)
-    assert "\n" not in message
-    return message
 
 
 @given(

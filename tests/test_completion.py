@@ -7,18 +7,23 @@ splits tracks in this way (it does, see `benchmarks/`), nor anything about image
 from __future__ import annotations
 
 import itertools
+import sqlite3
+from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
 
+from colmap_refract.cli import main
 from colmap_refract.errors import RefractError
 from colmap_refract.mapping.database import Correspondences
 from colmap_refract.mapping.retriangulation import complete_model, refine_with_database
 from colmap_refract.options import RefinerOptions, Scenario
 from colmap_refract.refiner.refinement import refine
 from colmap_refract.simulation import Capture, SceneOptions, ignore_refraction, noise_bound, point_rmse, simulate
+from colmap_refract.simulation.database import write_database
 
 SPLIT, DROPPED, LOST = 0.3, 0.1, 0.1
 """Parts of the points that are made two, of the observations and of the points that are taken away."""
@@ -210,3 +215,31 @@ def test_another_database_is_refused() -> None:
         refine_with_database(model, options, replace(matches, keypoints=[k[:-1] for k in matches.keypoints]))
     with pytest.raises(RefractError, match="are others in the database"):
         refine_with_database(model, options, replace(matches, keypoints=[k + 1 for k in matches.keypoints]))
+
+
+def contents(database: Path) -> list[str]:
+    """All that a database holds; its file also counts how often it was opened."""
+    with closing(sqlite3.connect(database)) as connection:
+        return list(connection.iterdump())
+
+
+def test_the_command_takes_a_database(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capture = capture_of("moving_interface")
+    write_database(tmp_path / "database.db", capture.reconstruction, wrong=0.05)
+    (tmp_path / "sparse").mkdir()
+    damage(ignore_refraction(capture)).write_binary(tmp_path / "sparse")
+    arguments = ["refiner", "--input_path", str(tmp_path / "sparse"), "--scenario", "moving_interface"]
+    database = tmp_path / "database.db"
+    before = contents(database)
+    assert main([*arguments, "--output_path", str(tmp_path / "out"), "--database_path", str(database)]) == 0
+    assert "points merged into others" in capsys.readouterr().out
+    assert contents(database) == before
+    assert main(["model_analyzer", "--path", str(tmp_path / "out")]) == 0
+    assert "points merged into others" in capsys.readouterr().out
+    assert partition(pycolmap.Reconstruction(tmp_path / "out"), capture)[1] == 0
+
+    for wrong in (tmp_path / "none.db", tmp_path / "sparse" / "cameras.bin"):
+        assert main([*arguments, "--output_path", str(tmp_path / "no"), "--database_path", str(wrong)]) == 1
+        error = capsys.readouterr().err
+        assert error.startswith("ERROR:") and error.count("\n") == 1 and str(wrong) in error
+        assert not (tmp_path / "no").exists()

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from colmap_refract.commands.flow_matcher import FlowMatcher
 from colmap_refract.errors import RefractError
 from colmap_refract.mapping import flow_database
-from colmap_refract.mapping.database import build_tracks, read_correspondences
+from colmap_refract.mapping.database import read_correspondences
 from colmap_refract.mapping.flow_database import create_flow_database
+from colmap_refract.mapping.tracks import build_tracks
 from colmap_refract.optical_flow.frame import FrameFlow
 from colmap_refract.optical_flow.options import FlowOptions
 from colmap_refract.optical_flow.tracking import FlowTracks

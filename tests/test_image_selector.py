@@ -10,7 +10,7 @@ import errno
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -19,10 +19,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from conftest import error_of, snapshot
 from numpy.typing import NDArray
 
 from colmap_refract.commands.image_selector import ImageSelector
-from colmap_refract.errors import RefractError
 from colmap_refract.frame_selection import choice
 from colmap_refract.frame_selection.choice import select_frames
 from colmap_refract.frame_selection.options import SelectionOptions
@@ -150,18 +150,6 @@ def select(sequence: Sequence, **options: Any) -> Selection:
 
 def indices(selection: Selection) -> list[int]:
     return [frame.index for frame in selection.chosen]
-
-
-def error_of(call: Callable[[], object]) -> str:
-    with pytest.raises(RefractError) as caught:
-        call()
-    message = str(caught.value)
-    assert message and "\n" not in message
-    return message
-
-
-def snapshot(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 # --- a fixed camera
@@ -530,7 +518,7 @@ def test_a_failing_exchange_puts_everything_back(
     out = tmp_path / "out"
     command(image_path=few, output_path=out).run()
     before = snapshot(tmp_path)
-    rename, calls = os.rename, []
+    replace, calls = os.replace, []
 
     def fail_once(source: Path, destination: Path) -> None:
         inside = Path(source).parent == out or Path(destination).parent == out
@@ -538,9 +526,9 @@ def test_a_failing_exchange_puts_everything_back(
             calls.append(source)
             if len(calls) == call + 1:
                 raise OSError(errno.EIO, "Input/output error")
-        rename(source, destination)
+        replace(source, destination)
 
-    monkeypatch.setattr(os, "rename", fail_once)
+    monkeypatch.setattr(os, "replace", fail_once)
     assert "Input/output" in error_of(command(image_path=few, output_path=out, overwrite=True, num_images=3).run)
     assert len(calls) > call
     assert snapshot(tmp_path) == before

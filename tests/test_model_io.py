@@ -6,18 +6,19 @@ import errno
 import re
 import shutil
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
+from conftest import error_of, snapshot
 
 from colmap_refract.errors import RefractError
-from colmap_refract.files import model_io
 from colmap_refract.files.model_io import copy_model, read_model, write_model
 from colmap_refract.files.output import output_folder
+from colmap_refract.files.quiet import quiet_pycolmap
 
 THREE = ("cameras", "images", "points3D")
 FIVE = (*THREE, "rigs", "frames")
@@ -58,23 +59,10 @@ def text_model(tmp_path: Path, text: Path) -> Path:
     return Path(shutil.copytree(text, tmp_path / "text_model"))
 
 
-def snapshot(folder: Path) -> dict[str, bytes]:
-    """Every file below `folder`, hidden ones included."""
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
-
-
 def patch(file: Path, at: int, data: bytes) -> None:
     content = bytearray(file.read_bytes())
     content[at : at + len(data)] = data
     file.write_bytes(content)
-
-
-def error_of(call: Callable[[], object]) -> str:
-    with pytest.raises(RefractError) as caught:
-        call()
-    message = str(caught.value)
-    assert "\n" not in message
-    return message
 
 
 def assert_same(a: pycolmap.Reconstruction, b: pycolmap.Reconstruction) -> None:
@@ -339,7 +327,7 @@ def test_text_that_means_something_else_to_pycolmap(text_model: Path) -> None:
 def test_colmap_logs_nothing(model: Path, capfd: pytest.CaptureFixture[str]) -> None:
     level = pycolmap.logging.minloglevel
     test_frame_with_an_image_that_is_gone(model)
-    with model_io._quiet_pycolmap():
+    with quiet_pycolmap():
         pycolmap.logging.error("unheard")
     pycolmap.logging.error("heard")
     assert pycolmap.logging.minloglevel == level

@@ -4,27 +4,14 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import pytest
+from conftest import error_of, snapshot
 
 from colmap_refract.errors import RefractError
 from colmap_refract.files.output import WORK_PREFIX, output_folder
-
-
-def snapshot(folder: Path) -> dict[str, bytes]:
-    """Every file below `folder`, hidden ones included."""
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
-
-
-def error_of(call: Callable[[], object]) -> str:
-    with pytest.raises(RefractError) as caught:
-        call()
-    message = str(caught.value)
-    assert "\n" not in message
-    return message
 
 
 def fill(folder: Path) -> None:
@@ -180,6 +167,15 @@ def test_folder_in_the_place_of_a_file(old: Path) -> None:
     (old / "points3D.bin").mkdir()
     assert "points3D.bin is a folder" in error_of(lambda: write_to(old, overwrite=True))
     assert snapshot(old) == OLD
+
+
+def test_other_files_than_a_models(old: Path) -> None:
+    """What goes is what the caller names; a folder replaces the one of its name with all that is in it."""
+    with output_folder(old, input_path=None, overwrite=True, own_files=("notes.txt", "images")) as folder:
+        (folder / "images").mkdir()
+        (folder / "images" / "2.png").write_bytes(b"new")
+    left = {name: data for name, data in OLD.items() if name not in FOREIGN}
+    assert snapshot(old) == left | {"images/2.png": b"new"}
 
 
 @pytest.mark.parametrize("exists", [True, False])

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from conftest import error_of
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from colmap_refract.errors import RefractError
 from colmap_refract.files.sidecar import ImageInterface, Sidecar, WorldPlane, read_sidecar, write_sidecar
 from colmap_refract.interface import Layers
 
@@ -145,14 +144,6 @@ def test_what_json_cannot_hold(tmp_path: Path) -> None:
         "flag": True,
         "layers": {"thickness": [], "index": [1.333]},
     }
-
-
-def error_of(call: Callable[[], object]) -> str:
-    with pytest.raises(RefractError) as caught:
-        call()
-    message = str(caught.value)
-    assert "\n" not in message
-    return message
 
 
 def edited(file: Path, *keys: Any, value: Any = None, remove: bool = False) -> Path:

@@ -6,8 +6,7 @@ serves them all.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -15,6 +14,7 @@ import numpy as np
 import pycolmap
 
 from colmap_refract.calibration.boards import View
+from colmap_refract.files.quiet import quiet_pycolmap
 from colmap_refract.interface import Array, tangent_basis
 
 Pose = tuple[Array, Array]
@@ -113,7 +113,7 @@ def adjust(
         options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
         options.ceres.loss_function_scale = _LOSS_SCALE
     covariance = None
-    with _quiet():
+    with quiet_pycolmap():  # starts may well fail
         adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
         usable = adjuster.solve().is_solution_usable() and bool(np.isfinite(model.camera(1).params).all())
         if usable and not robust:
@@ -154,14 +154,3 @@ def _copy(camera: pycolmap.Camera) -> pycolmap.Camera:
     return pycolmap.Camera(
         camera_id=1, model=camera.model, width=camera.width, height=camera.height, params=np.array(camera.params)
     )
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep the solver's log off the terminal: starts may well fail, and what is left open is said by the caller."""
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel = level

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from colmap_refract.errors import RefractError
 from colmap_refract.interface import Array
+from colmap_refract.photographs.images import Gray, shrink
 
-Gray = NDArray[np.uint8]
 BoardKind = Literal["chessboard", "charuco"]
 
 DICTIONARIES = sorted({name.upper() for name in dir(cv2.aruco) if name.startswith("DICT_")})
@@ -68,7 +68,7 @@ class Board:
                 f"a marker of {self.marker_size:g} times the side of a square does not fit into it; "
                 "give marker_size and square_size in the same unit"
             )
-        num_markers, known = self.num_columns * self.num_rows // 2, len(_dictionary(self.dictionary).bytesList)
+        num_markers, known = self.num_columns * self.num_rows // 2, _dictionary_size(self.dictionary)
         if num_markers > known:
             raise RefractError(
                 f"a charuco board of {self.num_columns} x {self.num_rows} squares has {num_markers} markers, "
@@ -240,10 +240,5 @@ def _near(num_columns: int, num_rows: int) -> list[tuple[int, int]]:
 
 def _reduced(gray: Gray) -> tuple[Gray, Array]:
     """A picture of at most `_FIND_SIZE`, and what its pixels measure in those of the given one (x, y)."""
-    height, width = gray.shape
-    factor = _FIND_SIZE / max(height, width)
-    if factor >= 1:
-        return gray, np.ones(2)
-    size = max(1, round(factor * width)), max(1, round(factor * height))
-    small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
-    return np.asarray(small, np.uint8), np.array([width / size[0], height / size[1]])
+    small = shrink(gray, _FIND_SIZE)
+    return small, np.divide(gray.shape, small.shape)[::-1]

@@ -48,8 +48,8 @@ class CameraCalibrator:
     ] = "OPENCV"
     """COLMAP's camera model. SIMPLE_RADIAL for few views, OPENCV_FISHEYE for more than about 120 degrees."""
     max_view_error: float | None = None
-    """Views with a larger reprojection error (rms), px, are dropped. By default three times the median of the views,
-    and no less than 0.2."""
+    """Views with a larger reprojection error (rms), px, are dropped.
+    By default three times the median of the views, and no less than 0.2."""
     overwrite: bool = False
     """Replace a calibration that is at output_path."""
 

@@ -37,8 +37,9 @@ class FlowMatcher:
         """Look, track, write, report."""
         from colmap_refract.files.cameras_file import read_cameras
         from colmap_refract.mapping.flow_database import calibrated_camera, check_new_database, create_flow_database
+        from colmap_refract.optical_flow.reference import check_names, choose_reference
         from colmap_refract.optical_flow.report import flow_report
-        from colmap_refract.optical_flow.tracking import check_names, choose_reference, track_against_reference
+        from colmap_refract.optical_flow.tracking import track_against_reference
         from colmap_refract.photographs.images import Gray, image_size, list_images, read_gray
 
         def read(name: str) -> Gray:

@@ -33,12 +33,10 @@ class Simulator:
     """
 
     scenario: Scenario
-    """What is shared: moving_interface (nothing: each image has its own pose and plane),
-    static_interface (one plane, fixed in the world), fixed_camera (one pose, a plane per image),
-    camera_housing (one plane per camera, fixed in the camera)."""
+    """What is shared (see refiner). Of a housing, the interface is the port."""
     layout: Layout = "orbit"
-    """Path of the camera: orbit (every image sees the same scene), strip or survey (one or several lines, each image
-    sees its own part)."""
+    """Path of the camera. orbit: every image sees the same scene.
+    strip and survey: one line or several, and each image sees its own part."""
     num_images: int = 15
     """Images taken."""
     output_path: Path | None = None

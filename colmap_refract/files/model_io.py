@@ -7,8 +7,6 @@ digest. Written files go through the same walk.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,6 +26,7 @@ from colmap_refract.files.model_files import (
     damaged,
     readable,
 )
+from colmap_refract.files.quiet import quiet_pycolmap
 from colmap_refract.files.text_files import tables_from_text
 
 if TYPE_CHECKING:
@@ -101,7 +100,7 @@ def write_model(reconstruction: pycolmap.Reconstruction, folder: Path) -> None:
         RefractError: the files cannot be written, or not whole because the disk is full.
     """
     cameras, images, points, rigs, frames = (folder / f"{name}.bin" for name in MODEL_NAMES + RIG_NAMES)
-    with _quiet_pycolmap():
+    with quiet_pycolmap():
         try:
             reconstruction.write_binary(folder)
             # COLMAP does not look whether the disk took what it wrote.
@@ -191,7 +190,7 @@ def _read_with_pycolmap(folder: Path, suffix: str) -> pycolmap.Reconstruction:
     import pycolmap
 
     reconstruction = pycolmap.Reconstruction()
-    with _quiet_pycolmap():
+    with quiet_pycolmap():
         try:
             (reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text)(folder)
             reconstruction.reg_image_ids()  # fails where a frame lists an image that does not exist
@@ -226,16 +225,3 @@ def _reason(error: Exception) -> str:
     """pycolmap's message as one short line, without the place in its source."""
     text = "".join(c if c.isprintable() else " " for c in str(error))
     return " ".join(re.sub(r"^\[\S+:\d+\] ", "", text).split())[:120]
-
-
-@contextmanager
-def _quiet_pycolmap() -> Iterator[None]:
-    """Keep COLMAP's log off the user's terminal; what matters comes as an exception."""
-    from pycolmap import logging
-
-    level = logging.minloglevel
-    logging.minloglevel = logging.FATAL.value
-    try:
-        yield
-    finally:
-        logging.minloglevel = level

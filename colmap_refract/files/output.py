@@ -1,46 +1,53 @@
-"""The output folder: a model appears in it whole or not at all."""
+"""The output folder: what is written to it appears whole or not at all."""
 
 from __future__ import annotations
 
 import errno
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from uuid import uuid4
 
-from colmap_refract.errors import RefractError
+from colmap_refract.errors import RefractError, reason_of
 from colmap_refract.files.model_files import MODEL_FILES
 from colmap_refract.files.sidecar import SIDECAR_NAME
 
-# What a folder that we write to must not keep of an earlier run.
-OWN_FILES = (*MODEL_FILES, SIDECAR_NAME)
+MODEL_AND_SIDECAR = (*MODEL_FILES, SIDECAR_NAME)
 WORK_PREFIX = ".colmap_refract-"  # of the temporary folders of `output_folder`
 # The user's to put right, wherever in the block they turn up.
 DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
 
 
 @contextmanager
-def output_folder(path: str | Path, *, input_path: str | Path | None, overwrite: bool) -> Iterator[Path]:
+def output_folder(
+    path: str | Path,
+    *,
+    input_path: str | Path | None,
+    overwrite: bool,
+    own_files: Collection[str] = MODEL_AND_SIDECAR,
+) -> Iterator[Path]:
     """A temporary folder whose files appear in `path` all together, and only if the block ends without an exception.
 
-    A `path` that does not exist is made by one rename. In a folder that exists, the files of the old model are moved
-    aside before the new ones are moved in, so that no reader ever finds a mixture, and deleted at last;
-    until then whatever goes wrong puts them back. Files that are not of a model stay where they are; a model in
-    the other form (`.txt`) goes, for readers would take it or be confused.
+    A `path` that does not exist is made by one rename. In a folder that exists, what an earlier run wrote is moved
+    aside before the new files are moved in, so that no reader ever finds a mixture, and deleted at last; until then
+    whatever goes wrong puts it back. Whatever else is in the folder stays.
 
     Args:
         path: folder to be written; its parents are made as needed.
-        input_path: folder of the model that is being refined, which must not be altered.
+        input_path: folder of what is read, such as the model to be refined, which must not be altered; None if there is
+            none to mistake it for.
         overwrite: whether a folder that is not empty may be written to.
+        own_files: names that go when they are not written anew. By default a model's in both its forms: of one that
+            stays beside the other, readers would take it or be confused.
 
     Yields:
         An empty folder on the same disk.
 
     Raises:
-        RefractError: `path` is the input, is a file, is not empty without `overwrite`, or cannot be written to. In
-            the block: the disk is full.
+        RefractError: `path` is the input, is a file, is not empty without `overwrite`, has a folder in the place of a
+            file, or cannot be written to. In the block: the disk is full.
     """
     path = Path(path)
     try:
@@ -68,7 +75,7 @@ def output_folder(path: str | Path, *, input_path: str | Path | None, overwrite:
         try:
             _sync(new)
             if exists:
-                _exchange(new, target, old)
+                _exchange(new, target, old, own_files)
             else:
                 os.rename(new, target)
             done = True
@@ -98,21 +105,23 @@ def _check_output(path: Path, target: Path, input_path: str | Path | None, overw
     # What a killed run left does not count.
     if not overwrite and any(not inside.name.startswith(WORK_PREFIX) for inside in target.iterdir()):
         raise RefractError(
-            f"the output folder {path} is not empty; choose another, or have the model in it overwritten (--overwrite)"
+            f"the output folder {path} is not empty; choose another, or have what an earlier run wrote replaced "
+            "(--overwrite)"
         )
 
 
 def _cannot_write(path: Path, error: Exception) -> RefractError:
-    reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-    return RefractError(f"cannot write to {path}: {reason}; choose another folder, nothing was changed in this one")
+    return RefractError(
+        f"cannot write to {path}: {reason_of(error)}; choose another folder, nothing was changed in this one"
+    )
 
 
-def _exchange(new: Path, target: Path, old: Path) -> None:
-    """Move the files of an old model in `target` to `old` and those in `new` to `target`, or nothing at all."""
+def _exchange(new: Path, target: Path, old: Path, own_files: Collection[str]) -> None:
+    """Move what is old in `target` to `old` and what is in `new` to `target`, or nothing at all."""
     entering = sorted(os.listdir(new))
-    moves = [(target / name, old / name) for name in sorted({*entering, *OWN_FILES}) if os.path.lexists(target / name)]
+    moves = [(target / name, old / name) for name in sorted({*entering, *own_files}) if os.path.lexists(target / name)]
     for occupied, _ in moves:
-        if occupied.is_dir():
+        if occupied.is_dir() and not (new / occupied.name).is_dir():
             raise RefractError(f"{occupied} is a folder where a file is to be written; move it away")
     moves += [(new / name, target / name) for name in entering]
     old.mkdir()

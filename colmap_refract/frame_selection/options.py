@@ -18,8 +18,8 @@ class SelectionOptions:
     num_images: int = 26
     """How many to choose, the reference included."""
     reference_image: str = ""
-    """Name of the reference. By default the frame that the others differ least from (fixed camera), or the
-    chosen one with most features."""
+    """Name of the reference.
+    By default the frame that the others differ least from (fixed camera), or the chosen one with most features."""
     min_num_features: int = 50
     """Frames with fewer SIFT features, in a copy of at most 640 pixels, are left out."""
     frame_step: int | None = None

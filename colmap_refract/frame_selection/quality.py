@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_refract.interface import Array
-from colmap_refract.photographs.images import Gray
+from colmap_refract.photographs.images import Gray, shrink
 
 SMALL_SIDE = 640
 """Longest side of the copy that features and flow are found in, pixels: enough for which frame to choose."""
@@ -21,7 +21,6 @@ _NOISE_SIGMA = 1.5  # of the smoothing, pixels, that keeps noise from passing fo
 _MIN_SHARPNESS = 0.65
 _MIN_FEATURES = 0.35
 _QUARTILE = 75
-
 
 Rejection = Literal["blurred", "few features"]
 
@@ -48,21 +47,12 @@ class Grades:
     """Why a frame cannot be used, in a word and in numbers; None if it can."""
 
 
-def shrink(gray: Gray, side: int = SMALL_SIDE) -> Gray:
-    """A copy whose longest side has at most `side` pixels, each the mean of those that it covers."""
-    scale = side / max(gray.shape)
-    if scale >= 1:
-        return gray
-    size = [max(1, round(length * scale)) for length in gray.shape]
-    return np.asarray(cv2.resize(gray, (size[1], size[0]), interpolation=cv2.INTER_AREA), np.uint8)
-
-
 def measure(gray: Gray, small: Gray) -> Quality:
     """Features and sharpness of a frame.
 
     Args:
         gray: the frame.
-        small: its copy by `shrink`.
+        small: its copy, shrunk to `SMALL_SIDE`.
     """
     smoothed = cv2.GaussianBlur(shrink(gray, _SHARP_SIDE).astype(np.float32), (0, 0), _NOISE_SIGMA)
     contrast = float(smoothed.std())

@@ -8,28 +8,19 @@ re-triangulate (Schoenberger and Frahm, Structure-from-Motion Revisited, 2016, s
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_refract.estimator.adjustment import SolverSettings, settle_points
-from colmap_refract.estimator.chunk import Held, Problem
-from colmap_refract.estimator.elimination import Tracks
-from colmap_refract.estimator.scenario import State, Structure
-from colmap_refract.estimator.triangulation import refracted_rays, triangulate, triangulation_angles
-from colmap_refract.files.sidecar import Sidecar
-from colmap_refract.interface import Array, Layers
-from colmap_refract.refiner.filtering import label_wet, reprojection_errors
-from colmap_refract.refiner.observations import Observations
+from colmap_refract.estimator.scenario import Index
+from colmap_refract.interface import Array
+from colmap_refract.mapping.known_views import Views
 
-Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 _ROUNDS = 10
 """Of each step, at most: a round adds what the one before has made reachable."""
-_LOSS_SCALE = 1.0
-"""Pixels, of the Cauchy loss that new points are settled with."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,119 +52,6 @@ class Limits:
     max_reproj_error: float = 4.0
     min_tri_angle: float = 0.5
     min_track_length: int = 3
-
-
-class Views:
-    """The K keypoints of all images, with poses and interfaces that are known and held.
-
-    Args:
-        keypoints: observations of one pseudo-point: every keypoint that takes part, in the model's units.
-        earlier: the interfaces, of the same model.
-        unit: model units per unit of the points here; about their depth, which the points' solver expects to be one.
-    """
-
-    def __init__(self, keypoints: Observations, earlier: Sidecar, unit: float) -> None:
-        count = len(keypoints.image_ids)
-        rotation, translation = keypoints.cam_from_world
-        normal, distance = np.tile([0.0, 0.0, 1.0], (count, 1)), np.ones(count)
-        plane = np.full(count, -1)
-        for i, name in enumerate(keypoints.image_names):
-            image = earlier.images.get(name)
-            if image is not None and image.normal_in_cam is not None and image.distance is not None:
-                normal[i], distance[i], plane[i] = image.normal_in_cam, image.distance / unit, i
-        self.keypoints = keypoints
-        self.structure = Structure(
-            image_pose=np.arange(count),
-            image_plane=plane,
-            image_camera=keypoints.image_camera,
-            sensor_rotation=np.tile(np.eye(3), (count, 1, 1)),
-            sensor_translation=np.zeros((count, 3)),
-            plane_in_world=np.zeros(count, dtype=np.bool_),
-            plane_anchor=np.zeros((count, 3)),
-        )
-        self.state = State(
-            rotation=rotation,
-            translation=translation / unit,
-            normal=normal,
-            distance=distance,
-            index=earlier.layers.refractive_index,
-            lens=np.zeros((len(keypoints.cameras), 0)),
-        )
-        self.layers: Layers = earlier.layers.scaled(1.0 / unit)
-        self.settings = SolverSettings()
-
-    @property
-    def image(self) -> Index:
-        """(K,) index of each keypoint's image."""
-        return self.keypoints.image
-
-    def problem(self, start: Index, keypoint: Index, points: Array) -> Problem:
-        """Points whose tracks are runs of `keypoint` between entries of `start`; all seen through the water."""
-        chosen = self.keypoints
-        image = chosen.image[keypoint]
-        return Problem(
-            tracks=Tracks(
-                start=start,
-                image=image.astype(np.int32),
-                direction=chosen.direction[keypoint],
-                metric=chosen.metric[keypoint],
-                lens=np.zeros((len(keypoint), 2, 0)),
-                wet=self.structure.image_plane[image] >= 0,
-            ),
-            structure=self.structure,
-            layers=self.layers,
-            state=self.state,
-            points=points,
-            held=Held.nothing(self.state),
-            loss="cauchy",
-            loss_scale=_LOSS_SCALE,
-        )
-
-    def errors(self, problem: Problem, keypoint: Index) -> Array:
-        """Exact reprojection errors (N,), px; infinite where a point is not seen."""
-        chosen = replace(
-            self.keypoints,
-            start=problem.tracks.start,
-            image=self.keypoints.image[keypoint],
-            pixel=self.keypoints.pixel[keypoint],
-            direction=self.keypoints.direction[keypoint],
-        )
-        problem = _on_the_right_side(problem)
-        errors = reprojection_errors(problem, chosen)
-        return np.where(np.isfinite(errors), errors, np.inf)
-
-    def triangulated(self, start: Index, keypoint: Index, *, settle: bool) -> tuple[Array, Array]:
-        """Where the rays of each run meet (P, 3), and the reprojection errors (N,) there.
-
-        Points that come out before the interface are triangulated once more with straight rays.
-        """
-        problem = self.problem(start, keypoint, np.zeros((len(start) - 1, 3)))
-        origin, ray = refracted_rays(problem.tracks, self.structure, self.state, self.layers)
-        # Where rays are parallel: somewhere on the first.
-        fallback = np.nan_to_num((origin + ray)[start[:-1]])
-        points = triangulate(problem.tracks, self.structure, self.state, self.layers, fallback)
-        problem = replace(problem, points=points)
-        side = _on_the_right_side(problem)
-        point = np.repeat(np.arange(len(start) - 1), np.diff(start))
-        dry = np.isin(point, point[side.tracks.wet != problem.tracks.wet])
-        if dry.any():
-            straight = replace(problem, tracks=problem.tracks._replace(wet=problem.tracks.wet & ~dry))
-            again = triangulate(straight.tracks, self.structure, self.state, self.layers, problem.points)
-            of_dry = np.zeros(len(points), dtype=np.bool_)
-            of_dry[point[dry]] = True
-            problem = replace(straight, points=np.where(of_dry[:, None], again, problem.points))
-        if settle:
-            problem = replace(problem, points=settle_points(problem, self.settings))
-        return problem.points, self.errors(problem, keypoint)
-
-    def angles(self, start: Index, keypoint: Index, points: Array) -> Array:
-        """Largest angle (P,), degrees, between the rays of each point."""
-        problem = _on_the_right_side(self.problem(start, keypoint, points))
-        return triangulation_angles(problem.tracks, self.structure, self.state, self.layers, points)
-
-
-def _on_the_right_side(problem: Problem) -> Problem:
-    return replace(problem, tracks=problem.tracks._replace(wet=label_wet(problem)))
 
 
 def complete_tracks(views: Views, label: Index, points: Array, matches: Index, limits: Limits) -> Completed:

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from uuid import uuid4
 
-from colmap_refract.errors import RefractError
+from colmap_refract.errors import RefractError, reason_of
 from colmap_refract.files.output import WORK_PREFIX
+from colmap_refract.files.quiet import quiet_pycolmap
 from colmap_refract.mapping.database import open_database, write_tracks
 
 if TYPE_CHECKING:
@@ -83,18 +84,15 @@ def create_flow_database(
 @contextmanager
 def _appearing(path: Path, *, num_bytes: int) -> Iterator[Path]:
     """The path of a temporary database, which is moved to `path` if the block ends without an exception."""
-    import pycolmap
-
     new = path.absolute().parent / f"{WORK_PREFIX}{uuid4().hex[:12]}.db"
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value  # what it would say is raised below
     try:
         # pycolmap ends the process when the disk is full at the end of a transaction, so that is found out before.
         with new.open("xb") as file:
             file.write(bytes(num_bytes))
             os.fsync(file.fileno())
         os.truncate(new, 0)
-        yield new
+        with quiet_pycolmap():
+            yield new
         with closing(sqlite3.connect(new)) as connection:
             connection.execute("PRAGMA journal_mode = DELETE")  # which brings all that was written into the one file
         with new.open("rb+") as file:
@@ -102,10 +100,8 @@ def _appearing(path: Path, *, num_bytes: int) -> Iterator[Path]:
         check_new_database(path)
         os.rename(new, path)
     except (OSError, sqlite3.Error) as error:
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise RefractError(f"cannot write {path}: {reason}; choose another database_path") from error
+        raise RefractError(f"cannot write {path}: {reason_of(error)}; choose another database_path") from error
     finally:
-        pycolmap.logging.minloglevel = level
         for side in _SIDE_FILES:
             with suppress(OSError):
                 os.unlink(f"{new}{side}")

@@ -7,27 +7,26 @@ refined.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from colmap_refract.errors import RefractError
+from colmap_refract.errors import RefractError, listed
 from colmap_refract.estimator.scenario import Index
 from colmap_refract.interface import Array
-from colmap_refract.mapping.database import Correspondences, Tracks, build_tracks, read_correspondences
+from colmap_refract.mapping.database import Correspondences, read_correspondences
 from colmap_refract.mapping.fixed_camera import start_fixed_camera
 from colmap_refract.mapping.model_from_database import observations_of_tracks, put_into_model, read_unposed_model
 from colmap_refract.mapping.moving_camera import start_moving_camera
 from colmap_refract.mapping.pairs import MIN_COMMON, choose_reference, common_points, connected_groups
+from colmap_refract.mapping.tracks import Tracks, build_tracks
 from colmap_refract.options import Scenario
 
 if TYPE_CHECKING:
     import pycolmap
-
-_MOST_NAMES = 5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,7 +141,7 @@ def initial_model(
         apart = [name for other in others for name in sorted(names[other])]
         warnings.append(
             f"{len(apart)} of {len(names)} images share too few points with the others and are left out: "
-            f"{_listed(apart)}"
+            f"{listed(apart)}"
         )
     reliability = None
     if scenario == "fixed_camera":
@@ -164,7 +163,7 @@ def initial_model(
         )
     missed = sorted(names[group[~start.posed_images[group]]])
     if missed:
-        warnings.append(f"no pose was found for {len(missed)} of {len(names)} images: {_listed(missed)}")
+        warnings.append(f"no pose was found for {len(missed)} of {len(names)} images: {listed(missed)}")
     model = put_into_model(unposed, start)
     used = [
         PairUsed(
@@ -204,14 +203,8 @@ def _guessed_intrinsics(unposed: pycolmap.Reconstruction, correspondences: Corre
     guessed = [i for i in used if not unposed.camera(i).has_prior_focal_length]
     if not guessed:
         return []
-    which = f"camera {guessed[0]}" if len(guessed) == 1 else f"{len(guessed)} cameras ({_listed(map(str, guessed))})"
+    which = f"camera {guessed[0]}" if len(guessed) == 1 else f"{len(guessed)} cameras ({listed(map(str, guessed))})"
     return [
         f"the intrinsics of {which} are a guess, without a prior focal length, and the start is no better than they "
         "are: give those calibrated in air (camera_path)"
     ]
-
-
-def _listed(names: Iterable[str]) -> str:
-    names = list(names)
-    more = f", ... ({len(names)} in all)" if len(names) > _MOST_NAMES else ""
-    return ", ".join(names[:_MOST_NAMES]) + more

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_refract.errors import RefractError
-from colmap_refract.mapping.database import Correspondences, Tracks, read_database
+from colmap_refract.mapping.database import Correspondences, read_database
+from colmap_refract.mapping.tracks import Tracks
 from colmap_refract.refiner.observations import Observations, lift
 
 if TYPE_CHECKING:

@@ -3,7 +3,6 @@ from them."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from colmap_refract.errors import RefractError
 from colmap_refract.estimator.scenario import Index
+from colmap_refract.machine import threads
 from colmap_refract.mapping.clouds import Cloud, average_clouds, pair_cloud
 from colmap_refract.mapping.dry_adjustment import Mask, settle
 from colmap_refract.mapping.model_from_database import Posed
@@ -54,7 +54,7 @@ def start_moving_camera(
     Raises:
         RefractError: no pair has a geometry, or no image can be placed beside the first.
     """
-    num_threads = num_threads if num_threads > 0 else os.cpu_count() or 1
+    num_threads = threads(num_threads)
     single = without_rigs(observations)
     first, clouds = _first_clouds(single, common, group, anchor, random_seed)
     registered = begin(single, first, average_clouds(clouds, len(single.points)))

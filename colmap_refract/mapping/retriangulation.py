@@ -12,8 +12,9 @@ import numpy as np
 from colmap_refract.errors import RefractError
 from colmap_refract.files.model_io import copy_model
 from colmap_refract.files.sidecar import Sidecar
-from colmap_refract.mapping.completion import Completed, Index, Limits, Views, complete_tracks
-from colmap_refract.mapping.database import Correspondences
+from colmap_refract.mapping.completion import Completed, Limits, complete_tracks
+from colmap_refract.mapping.database import Correspondences, Index
+from colmap_refract.mapping.known_views import Views
 from colmap_refract.options import ImageNotes, RefinerOptions
 from colmap_refract.refiner.continuation import Watch
 from colmap_refract.refiner.observations import Observations, lift, read_observations

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from colmap_refract.interface import Array
 from colmap_refract.optical_flow.field import Field
 from colmap_refract.optical_flow.options import FlowMethod
-from colmap_refract.photographs.images import Gray
+from colmap_refract.photographs.images import Gray, shrink
 
 _COARSE_SIDE = 192  # pixels of the copies that the affine start is sought in, where waves and blur are small
 _TILES = (7, 5)  # along the longer and the shorter side
@@ -31,7 +31,7 @@ def affine_start(reference: Gray, frame: Gray) -> Array:
     correlation of tiles and RANSAC; the identity where too few tiles agree.
     """
     scale = min(1.0, _COARSE_SIDE / max(reference.shape))
-    a, b = (_shrunk(picture, scale) for picture in (reference, frame))
+    a, b = shrink(reference, _COARSE_SIDE), shrink(frame, _COARSE_SIDE)
     height, width = a.shape
     tile = max(8, round(_TILE * max(a.shape)))
     reach = round(_REACH * max(a.shape))
@@ -122,25 +122,18 @@ def lucas_kanade(
 
 def _dense(first: Gray, second: Gray, affine: Array) -> Field:
     """Flow of the whole picture."""
-    scale = min(1.0, _DENSE_SIDE / max(first.shape))
     height, width = first.shape
-    if scale < 1:
-        first, second = (_shrunk(picture, scale) for picture in (first, second))
+    first, second = shrink(first, _DENSE_SIDE), shrink(second, _DENSE_SIDE)
     y, x = np.mgrid[0 : first.shape[0], 0 : first.shape[1]]
     pixels = np.stack([x, y], axis=-1).reshape(-1, 2)
     ratio = np.array([width, height]) / first.shape[::-1]
     start = (_mapped(affine, (pixels + 0.5) * ratio - 0.5) + 0.5) / ratio - 0.5 - pixels
     flow = start.reshape(*first.shape, 2).astype(np.float32)
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(first, second, flow)
-    if scale < 1:
+    if first.shape != (height, width):
         flow = cv2.resize(flow, (width, height), interpolation=cv2.INTER_LINEAR) * ratio.astype(np.float32)
     return Field(np.asarray(flow))
 
 
 def _mapped(affine: Array, points: Array) -> Array:
     return points @ affine[:, :2].T + affine[:, 2]
-
-
-def _shrunk(picture: Gray, scale: float) -> Gray:
-    size = [max(1, round(length * scale)) for length in picture.shape]
-    return np.asarray(cv2.resize(picture, (size[1], size[0]), interpolation=cv2.INTER_AREA), np.uint8)

@@ -15,18 +15,18 @@ class FlowOptions:
     """How points of the reference frame are found in the others. Lengths in pixels."""
 
     method: FlowMethod = "dense"
-    """How the first estimate is made, which is then refined the same way: dense (DIS optical flow of the whole
-    picture), features (Lucas and Kanade's pyramids at the points alone: in half the time)."""
+    """How the first estimate is made, which is then refined the same way.
+    dense: DIS optical flow of the whole picture. features: Lucas and Kanade's pyramids at the points alone: faster."""
     max_num_points: int = 2000
     """Points of the reference frame that are tracked, at most."""
     window_size: int = 21
-    """Width of the square around a point that is compared. Larger for blurred or noisy pictures,
-    smaller for short waves."""
+    """Width of the square around a point that is compared.
+    Larger for blurred or noisy pictures, smaller for short waves."""
     max_error: float = 0.3
     """A track is kept if it leads forth to a frame and back to within this distance of where it began."""
     min_correlation: float = 0.8
-    """A track is kept if the squares around its ends correlate as much, 1 at most, after the deformation between them
-    is undone. What glitters or is covered in one frame does not."""
+    """A track is kept if the squares around its ends, once their deformation is undone, correlate as much (at most 1).
+    What glitters or is covered in one frame does not."""
 
     def __post_init__(self) -> None:
         if self.max_num_points < 1:

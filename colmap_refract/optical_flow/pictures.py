@@ -1,6 +1,6 @@
 """Pictures made comparable: the same brightness, the same contrast, the same sharpness; and how well they then agree.
 
-Points are in OpenCV's pixels in all modules named `flow_...`: the centre of the top-left pixel is at (0, 0).
+Points are in OpenCV's pixels in this folder: the centre of the top-left pixel is at (0, 0).
 """
 
 from __future__ import annotations

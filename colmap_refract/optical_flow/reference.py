@@ -10,11 +10,11 @@ import numpy as np
 
 from colmap_refract.errors import RefractError
 from colmap_refract.frame_selection.fixed_camera import choose
-from colmap_refract.frame_selection.quality import grade, measure, shrink
+from colmap_refract.frame_selection.quality import SMALL_SIDE, grade, measure
 from colmap_refract.interface import Array
 from colmap_refract.optical_flow.options import FlowOptions
 from colmap_refract.optical_flow.pictures import level
-from colmap_refract.photographs.images import Gray, common_size
+from colmap_refract.photographs.images import Gray, common_size, shrink
 
 Read = Callable[[str], Gray]
 """The grey values (H, W) of a frame by its name."""
@@ -23,10 +23,6 @@ Watch = Callable[[str], None]
 
 _CORNER_QUALITY = 1e-3  # of the best; the picture is levelled, so that reflections do not set the measure
 _POINTS_PER_CELL = 4
-
-
-def nobody(_: str) -> None:
-    """Watches."""
 
 
 def check_names(names: Sequence[str], reference: str | None = None) -> None:
@@ -41,7 +37,7 @@ def check_names(names: Sequence[str], reference: str | None = None) -> None:
         )
 
 
-def choose_reference(read: Read, names: Sequence[str], *, watch: Watch = nobody) -> str:
+def choose_reference(read: Read, names: Sequence[str], *, watch: Watch = lambda _: None) -> str:
     """The frame that differs least from the others, as frames are chosen for a fixed camera.
 
     Small copies of all frames are kept in memory, 0.3 MB each.
@@ -57,7 +53,7 @@ def choose_reference(read: Read, names: Sequence[str], *, watch: Watch = nobody)
         gray = read(name)
         by_size.setdefault((gray.shape[1], gray.shape[0]), [name])
         common_size(by_size)
-        smalls.append(shrink(gray))
+        smalls.append(shrink(gray, SMALL_SIDE))
         qualities.append(measure(gray, smalls[-1]))
     grades = grade(qualities, min_num_features=1, window=None)
     usable = [k for k, rejection in enumerate(grades.rejections) if rejection is None] or list(range(len(names)))

@@ -3,11 +3,11 @@
 Neighbouring frames through waves differ little, but blur: what a feature descriptor no longer matches can still be
 tracked. Each frame is tracked from the reference by itself, so that errors do not add up:
 
-1. an affine map by correlation of coarse tiles (`flow_estimate`), for a tilted surface shifts the whole picture;
-2. optical flow from there, forth and back, which gives a smooth field of displacements (`flow_field`);
-3. the frame pulled straight by that field and made as bright and sharp as the reference (`flow_pictures`), in which
-   Lucas and Kanade's method then finds what is left (`flow_frame`): without the deformation, its error is that of
-   noise alone;
+1. an affine map by correlation of coarse tiles (`estimate`), for a tilted surface shifts the whole picture;
+2. optical flow from there, forth and back, which gives a smooth field of displacements (`field`);
+3. the frame pulled straight by that field and made as bright and sharp as the reference (`pictures`), in which Lucas
+   and Kanade's method then finds what is left (`frame`): without the deformation, its error is that of noise
+   alone;
 4. the checks: forth and back again, and correlation.
 """
 
@@ -22,17 +22,8 @@ from colmap_refract.errors import RefractError
 from colmap_refract.interface import Array
 from colmap_refract.optical_flow.frame import MIN_TRACKS, FrameFlow, Index, track_frame
 from colmap_refract.optical_flow.options import FlowOptions
-from colmap_refract.optical_flow.reference import (
-    Read,
-    Watch,
-    check_names,
-    choose_reference,
-    find_corners,
-    nobody,
-)
+from colmap_refract.optical_flow.reference import Read, Watch, check_names, find_corners
 from colmap_refract.photographs.images import common_size
-
-__all__ = ["FlowTracks", "FrameFlow", "check_names", "choose_reference", "track_against_reference"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +46,7 @@ class FlowTracks:
 
 
 def track_against_reference(
-    read: Read, names: Sequence[str], reference: str, options: FlowOptions, *, watch: Watch = nobody
+    read: Read, names: Sequence[str], reference: str, options: FlowOptions, *, watch: Watch = lambda _: None
 ) -> FlowTracks:
     """Track points of the reference frame to every other frame.
 

@@ -1,1 +1,1 @@
-"""Photographs as they are on disk: image files, videos, and which of their frames to reconstruct from."""
+"""Photographs as they are on disk: image files, videos, frames in their order."""

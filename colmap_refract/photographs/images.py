@@ -14,8 +14,6 @@ from colmap_refract.errors import RefractError
 
 Gray: TypeAlias = NDArray[np.uint8]
 """Shape (H, W), 0 is black."""
-Color: TypeAlias = NDArray[np.uint8]
-"""Shape (H, W, 3), RGB."""
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".jpe", ".png", ".bmp", ".tif", ".tiff", ".ppm", ".pgm", ".pnm", ".webp"})
 """Formats that both COLMAP and OpenCV read; WebP only where COLMAP was built with it."""
@@ -59,16 +57,6 @@ def read_gray(path: Path) -> Gray:
         RefractError: the file cannot be read.
     """
     return _to_8_bit(_decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH))
-
-
-def read_color(path: Path) -> Color:
-    """The colours of an image file, (H, W, 3) RGB, 16-bit and floating-point images scaled to 8 bit.
-
-    Raises:
-        RefractError: the file cannot be read.
-    """
-    image = _to_8_bit(_decode(path, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH))
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB if image.ndim == 2 else cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -116,6 +104,15 @@ def common_size(by_size: dict[tuple[int, int], list[str]]) -> tuple[int, int]:
             f"has {other[0]} x {other[1]}; give images of one camera"
         )
     return size
+
+
+def shrink(gray: Gray, side: int) -> Gray:
+    """A copy whose longer side has `side` pixels, each the mean of those that it covers; a smaller picture as it is."""
+    scale = side / max(gray.shape)
+    if scale >= 1:
+        return gray
+    height, width = (max(1, round(length * scale)) for length in gray.shape)
+    return np.asarray(cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _decode(path: Path, flags: int) -> NDArray[Any]:

@@ -9,6 +9,7 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Literal
 
 from colmap_refract.errors import RefractError
+from colmap_refract.files.quiet import quiet_pycolmap
 from colmap_refract.reconstructor.inventory import by_size, only_size
 from colmap_refract.reconstructor.record import Photograph
 
@@ -155,11 +156,8 @@ def _guess(path: Path) -> pycolmap.Camera:
     """COLMAP's guess of the camera that took an image: the focal length from EXIF, or 1.2 times the longer side."""
     import pycolmap
 
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     try:
-        return pycolmap.infer_camera_from_image(path)
+        with quiet_pycolmap():
+            return pycolmap.infer_camera_from_image(path)
     except (RuntimeError, ValueError):
         raise RefractError(f"COLMAP cannot read the image {path}; remove or replace it") from None
-    finally:
-        pycolmap.logging.minloglevel = level

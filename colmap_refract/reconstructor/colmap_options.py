@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from colmap_refract.errors import RefractError
+from colmap_refract.files.quiet import quiet_pycolmap
 from colmap_refract.reconstructor.options import ReconstructorOptions, given
 
 if TYPE_CHECKING:
@@ -96,11 +97,7 @@ def check_options(options: ReconstructorOptions) -> None:
 
 def _set(target: Any, values: dict[str, Any]) -> None:
     """Set options one by one, so that a value which COLMAP refuses is known by its name."""
-    import pycolmap
-
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
-    try:
+    with quiet_pycolmap():
         for name, value in values.items():
             try:
                 setattr(target, name, value)
@@ -109,5 +106,3 @@ def _set(target: Any, values: dict[str, Any]) -> None:
                 sound = False
             if not sound:
                 raise RefractError(f"this COLMAP refuses {name} {value!r}; give another value")
-    finally:
-        pycolmap.logging.minloglevel = level

@@ -97,9 +97,11 @@ def _wait(
     def listen() -> None:
         for line in stdout:
             try:
-                messages.put(json.loads(line))
+                message = json.loads(line)
             except ValueError:
-                continue  # not ours: a library that prints
+                continue
+            if isinstance(message, dict):  # what else there is, a library has printed
+                messages.put(message)
         messages.put(None)
 
     threading.Thread(target=listen, daemon=True).start()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from colmap_refract.errors import RefractError
 from colmap_refract.mapping.database import open_database
@@ -24,9 +24,6 @@ from colmap_refract.reconstructor.workspace_database import (
     put_database,
     warn_of_intrinsics,
 )
-
-if TYPE_CHECKING:
-    pass
 
 _STAGE = "Extracting features"
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from colmap_refract.errors import RefractError
+from colmap_refract.errors import RefractError, listed
 from colmap_refract.files.model_io import read_model, write_model
 from colmap_refract.mapping.database import open_database
 from colmap_refract.options import RefinerOptions
@@ -27,7 +27,6 @@ MAPPING = "mapping"
 USABLE = 0.5
 """Part of the images that the mapper has to register before start values from pairs are not even tried."""
 _STAGE = "Mapping"
-_MOST_NAMES = 5
 _NO_MODEL = (
     "the mapper finds no model: take more images that overlap, try --Mapper.init_min_num_inliers 50, or --scenario "
     "fixed_camera if the camera stood still"
@@ -187,9 +186,10 @@ def _from_pairs(
     workspace: Workspace, database_path: Path, refiner: RefinerOptions
 ) -> tuple[pycolmap.Reconstruction | None, str]:
     """Start values as the paper finds them, or why there are none."""
-    from colmap_refract.mapping.database import build_tracks, read_correspondences
+    from colmap_refract.mapping.database import read_correspondences
     from colmap_refract.mapping.initial import initial_model
     from colmap_refract.mapping.model_from_database import read_unposed_model
+    from colmap_refract.mapping.tracks import build_tracks
 
     stage, watcher = "Start values from pairs of images", workspace.watcher
     watcher.say(f"{stage} ...")
@@ -250,15 +250,10 @@ def _report(workspace: Workspace, database: Database, models: list[pycolmap.Reco
         watcher.warn("less than half of the images are in the model: more overlap, or more features, would help")
     missing = sorted(names - {image.name for image in first.images.values() if image.has_pose})
     if missing:
-        watcher.report("Not registered", _listed(missing))
+        watcher.report("Not registered", listed(missing))
     for number, model in enumerate(models[1:], start=1):
         others = sorted(image.name for image in model.images.values() if image.has_pose)
         watcher.report(
             f"Model {number}, apart",
-            f"{len(others)} images in {workspace.sparse_path / str(number)}, not refined: {_listed(others)}",
+            f"{len(others)} images in {workspace.sparse_path / str(number)}, not refined: {listed(others)}",
         )
-
-
-def _listed(names: list[str]) -> str:
-    more = f", ... ({len(names)} in all)" if len(names) > _MOST_NAMES else ""
-    return ", ".join(names[:_MOST_NAMES]) + more

@@ -139,8 +139,8 @@ class MapperOptions:
     abs_pose_min_inlier_ratio: float | None = None
     """Part of an image's points that its pose explains."""
     filter_max_reproj_error: float | None = None
-    """Observations with a larger straight-ray error, px, are removed. By default 1 % of the images' longer side, and at
-    least 4, COLMAP's."""
+    """Observations with a larger straight-ray error, px, are removed.
+    By default 1 % of the images' longer side, and at least 4, COLMAP's."""
     filter_min_tri_angle: float | None = None
     """Points whose rays meet at a smaller angle, degrees, are removed."""
     tri_min_angle: float | None = None
@@ -162,12 +162,12 @@ class ReconstructorOptions:
     """From photographs to a model that ignores refraction, and what the refiner makes of it."""
 
     matcher: Matcher = "exhaustive"
-    """exhaustive: every image with every other; sequential: with those that follow by name; flow: optical flow
-    against a reference frame in place of features (fixed_camera)."""
+    """exhaustive: every image with every other; sequential: with those that follow by name.
+    flow (fixed_camera only): optical flow against a reference frame, in place of features."""
     refine: bool = True
     """0: stop after COLMAP's own mapping."""
     complete_tracks: bool = True
-    """Give tracks back with refracted rays what verification and mapping with straight rays took from them."""
+    """Give tracks back, with refracted rays, what verification and mapping with straight rays took from them."""
     FeatureExtraction: FeatureExtractionOptions = FeatureExtractionOptions()
     SiftExtraction: SiftExtractionOptions = SiftExtractionOptions()
     FeatureMatching: FeatureMatchingOptions = FeatureMatchingOptions()
@@ -187,9 +187,9 @@ class ReconstructorOptions:
 def widened(options: ReconstructorOptions, longer_side: int) -> ReconstructorOptions:
     """Limits in pixels that are not given, wide enough for straight rays.
 
-    What straight rays miss refracted ones by is a part of the image, whatever its number of pixels. Through moving
-    water, 1 % in place of half as much halved the errors after the refinement, and twice as much changed nothing.
-    Wrong matches that pass are removed later, by their refracted rays.
+    What straight rays miss refracted ones by is a part of the image, whatever its number of pixels. In trials through
+    moving water, half of this limit cost accuracy after the refinement, and twice of it brought none. Wrong matches
+    that pass are removed later, by their refracted rays.
 
     Args:
         options: not altered.

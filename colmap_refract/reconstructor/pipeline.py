@@ -10,6 +10,7 @@ from pathlib import Path
 from colmap_refract.errors import RefractError
 from colmap_refract.files.cameras_file import read_cameras
 from colmap_refract.files.sidecar import Sidecar
+from colmap_refract.machine import threads
 from colmap_refract.options import ImageNotes, RefinerOptions
 from colmap_refract.photographs.images import list_images
 from colmap_refract.reconstructor.calibration import Assignment, assign_cameras
@@ -73,7 +74,7 @@ def reconstruct(
         KeyboardInterrupt: Ctrl-C; the next run goes on from there.
     """
     watcher = watcher or Watcher()
-    refiner = replace(refiner, num_threads=refiner.num_threads if refiner.num_threads > 0 else _num_cores())
+    refiner = replace(refiner, num_threads=threads(refiner.num_threads))
     images = image_path if image_path is not None else workspace_path / "images"
     if options.matcher == "flow" and refiner.scenario != "fixed_camera":
         raise RefractError("--matcher flow follows the pixels of a camera that stands still: it needs fixed_camera")
@@ -132,8 +133,3 @@ def _report_images(watcher: Watcher, num_images: int, assignment: Assignment) ->
     sizes = ", ".join(f"{group.camera.width} x {group.camera.height}" for group in assignment.groups)
     remarks = "".join(f"; {remark}" for remark in assignment.remarks)
     watcher.report("Images", f"{num_images}, {sizes} pixels{remarks}")
-
-
-def _num_cores() -> int:
-    """Cores that this process may use, where the system tells."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

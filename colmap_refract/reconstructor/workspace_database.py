@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from colmap_refract.errors import RefractError
+from colmap_refract.errors import RefractError, reason_of
 from colmap_refract.reconstructor.calibration import Assignment
 from colmap_refract.reconstructor.contents import Contents, camera_key
 from colmap_refract.reconstructor.record import Photograph
@@ -106,8 +106,9 @@ def put_database(workspace: Workspace, new: Path) -> None:
             Path(f"{path}{suffix}").unlink(missing_ok=True)
         shutil.move(new, path)
     except (OSError, sqlite3.Error) as error:
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise RefractError(f"cannot write {path}: {reason}; make room, or give another database_path") from error
+        raise RefractError(
+            f"cannot write {path}: {reason_of(error)}; make room, or give another database_path"
+        ) from error
     record.database_mark = mark
     record.stages.pop(FEATURES, None)
     record.stages.pop(MATCHES, None)

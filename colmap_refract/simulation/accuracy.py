@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_refract.errors import RefractError
 from colmap_refract.interface import Array, plane_in_world
@@ -32,14 +33,10 @@ def point_rmse(reconstruction: pycolmap.Reconstruction, capture: Capture, robust
         raise RefractError(f"{len(common)} points in common with the truth; three are needed")
     source = np.array([reconstruction.points3D[i].xyz for i in common])
     target = np.array([truth.points3D[i].xyz for i in common])
-    if not robust:
-        return float(np.sqrt(np.mean(np.sum((align(source, target, source) - target) ** 2, axis=1))))
-    # Runaway points would spoil a first alignment, and they are far from the others.
-    error = np.linalg.norm(source - np.median(source, axis=0), axis=1)
-    for _ in range(20):
-        best = np.argsort(error)[: max(3, int(0.9 * len(error)))]
-        error = np.linalg.norm(align(source[best], target[best], source) - target, axis=1)
-    return float(np.median(error))
+    if robust:
+        aligned, _ = align_to_best(source, target)
+        return float(np.median(np.linalg.norm(aligned - target, axis=1)))
+    return float(np.sqrt(np.mean(np.sum((align(source, target, source) - target) ** 2, axis=1))))
 
 
 def align(source: Array, target: Array, points: Array) -> Array:
@@ -49,6 +46,20 @@ def align(source: Array, target: Array, points: Array) -> Array:
     sign = np.array([1.0, 1.0, np.linalg.det(u @ vt)])
     scale = singular @ sign / np.sum((source - source_mean) ** 2)
     return np.asarray(scale * (points - source_mean) @ (u * sign @ vt).T + target_mean)
+
+
+def align_to_best(found: Array, true: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Points (P, 3), brought to the truth by the similarity of the best 90 %, and which those are.
+
+    Runaway points would spoil a first alignment, and they are far from the others: it begins without them.
+    """
+    error = np.linalg.norm(found - np.median(found, axis=0), axis=1)
+    best = np.arange(len(found))
+    for _ in range(20):
+        best = np.argsort(error)[: max(3, int(0.9 * len(error)))]
+        aligned = align(found[best], true[best], found)
+        error = np.linalg.norm(aligned - true, axis=1)
+    return aligned, best
 
 
 def noise_bound(capture: Capture) -> float:

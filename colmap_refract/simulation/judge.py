@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from colmap_refract.errors import RefractError
 from colmap_refract.interface import Array
-from colmap_refract.simulation.accuracy import align
+from colmap_refract.simulation.accuracy import align, align_to_best
 from colmap_refract.simulation.precision import Configuration, Precision, precision
 from colmap_refract.simulation.truth import Truth
 
@@ -242,20 +242,6 @@ def bound_of(sightings: Sightings, truth: Truth) -> Precision:
             cameras=[truth.cameras[camera_id] for camera_id in camera_ids],
         )
     )
-
-
-def align_to_best(found: Array, true: Array) -> tuple[Array, Index]:
-    """Points (P, 3), brought to the truth by the similarity of the best 90 %, and which those are.
-
-    Runaway points would spoil a first alignment, and they are far from the others: it begins without them.
-    """
-    error = np.linalg.norm(found - np.median(found, axis=0), axis=1)
-    best = np.arange(len(found))
-    for _ in range(20):
-        best = np.argsort(error)[: max(3, int(0.9 * len(error)))]
-        aligned = align(found[best], true[best], found)
-        error = np.linalg.norm(aligned - true, axis=1)
-    return aligned, best
 
 
 def _group_median(values: Array, group: Index, valid: Mask, count: int) -> Array:

@@ -123,7 +123,7 @@ def alternatives(options: SceneOptions) -> dict[str, Accuracy]:
     if options.scenario != "camera_housing":
         nearer = 0.5 * options.interface_height
         depth = options.camera_height - nearer
-        lower = replace(options, depth=depth, distance_ratio=nearer / depth, relief=_relief(options))
+        lower = replace(options, depth=depth, distance_ratio=nearer / depth, relief=options.floor_relief)
         changed[f"cameras {nearer:.3g} m above the water"] = lower
     out = {}
     for name, other in changed.items():
@@ -133,12 +133,6 @@ def alternatives(options: SceneOptions) -> dict[str, Accuracy]:
             # An interface that would reach behind a camera, or views that no longer overlap.
             continue
     return out
-
-
-def _relief(options: SceneOptions) -> float:
-    """The relief that the scene has now."""
-    water = options.camera_height - options.interface_height
-    return options.relief if options.relief is not None else min(0.25 * options.scene_size, 0.7 * water)
 
 
 def _wave_shift(truth: Truth) -> float:

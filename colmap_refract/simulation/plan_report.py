@@ -39,14 +39,14 @@ def report(plan: Plan, others: Mapping[str, Accuracy]) -> str:
         "=" * _WIDTH,
         _row("Camera", camera),
         _row("View in air", f"{plan.view_deg[0]:.0f} x {plan.view_deg[1]:.0f} deg"),
-        _row("Heights", f"{_m(scene.interface_height)} to the {place}, {_m(options.water)} of water"),
+        _row("Heights", f"{_m(scene.interface_height)} to the {place}, {_m(scene.water_depth)} of water"),
         _row("One image shows", f"{plan.footprint[0]:.2f} x {plan.footprint[1]:.2f} m of the ground"),
         _row("A pixel shows", f"{1e3 * plan.sample_distance:.3g} mm of the ground"),
         _row("Images", f"{scene.num_images}; a point is in {plan.observations_per_point:.0f} of them (median)"),
         _row("Points in two images or more", f"{plan.num_points} of {scene.num_points}"),
     ]
     if options.waves:
-        periods = ", ".join(f"{wave.period(options.water):.2g} s" for wave in options.waves)
+        periods = ", ".join(f"{wave.period(scene.water_depth):.2g} s" for wave in options.waves)
         lines += [
             _row("Waves", f"periods {periods}, slope {np.degrees(np.arctan(plan.wave_slope)):.2g} deg (rms)"),
             _row("They move keypoints by", f"{plan.wave_shift:.2g} px (rms, per axis)"),

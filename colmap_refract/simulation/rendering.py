@@ -15,11 +15,10 @@ import numpy as np
 
 from colmap_refract.errors import RefractError
 from colmap_refract.interface import Array
+from colmap_refract.machine import threads
 from colmap_refract.simulation.terrain import Terrain
 from colmap_refract.simulation.texture import Image, Texture, srgb_decoding, srgb_encoded
-from colmap_refract.simulation.view import View, optics, project, trace
-
-__all__ = ["Look", "View", "develop", "project", "radiance", "render", "trace"]
+from colmap_refract.simulation.view import View, optics
 
 Colour = tuple[float, float, float]
 
@@ -97,8 +96,6 @@ def render(
 
 def radiance(view: View, terrain: Terrain, texture: Texture, look: Look, *, num_threads: int = -1) -> Array:
     """Linear light (H, W, 3) that comes to the pixels, before lens blur and sensor; the arguments are `render`'s."""
-    import os
-
     from colmap_refract.simulation.painting import paint
 
     view.check()
@@ -141,7 +138,7 @@ def radiance(view: View, terrain: Terrain, texture: Texture, look: Look, *, num_
 
     # Blocks of about a megabyte of rays: few enough calls, and little to wait for at the end.
     rows_at_once = max(1, 40_000 // (width * n * n))
-    with ThreadPoolExecutor(num_threads if num_threads > 0 else os.cpu_count() or 1) as pool:
+    with ThreadPoolExecutor(threads(num_threads)) as pool:
         list(pool.map(paint_rows, range(0, height, rows_at_once)))
     return look.exposure * light
 

@@ -74,7 +74,7 @@ class SceneOptions:
             raise RefractError("camera_housing has no dry points: leave dry_point_ratio at 0")
         if self.camera_params and self.num_cameras * self.sensors_per_frame > 1:
             raise RefractError("camera_params are those of one camera: leave num_cameras and sensors_per_frame at 1")
-        if self.relief is not None and not 0 <= self.relief < 2 * (self.camera_height - self.interface_height):
+        if self.relief is not None and not 0 <= self.relief < 2 * self.water_depth:
             raise RefractError(
                 f"a relief of {self.relief:g} m reaches out of the water: give less than twice its depth"
             )
@@ -99,12 +99,21 @@ class SceneOptions:
         return self.camera_height - 0.6 * self.scene_size
 
     @property
+    def water_depth(self) -> float:
+        """From the mean interface to the mean floor, metres."""
+        return self.camera_height - self.interface_height
+
+    @property
+    def floor_relief(self) -> float:
+        """`relief`, or its default, metres."""
+        return self.relief if self.relief is not None else min(0.25 * self.scene_size, 0.7 * self.water_depth)
+
+    @property
     def footprint(self) -> Array:
         """Width and height of the part of the mean floor that a vertical view shows, (2,), metres."""
         tangent = 0.5 * np.array([self.width, self.height]) / self.focal_length
         sine = np.minimum(tangent / np.hypot(1, tangent) / self.layers.refractive_index, 0.95)
-        water = self.camera_height - self.interface_height
-        return np.asarray(2 * (self.interface_height * tangent + water * sine / np.sqrt(1 - sine**2)))
+        return np.asarray(2 * (self.interface_height * tangent + self.water_depth * sine / np.sqrt(1 - sine**2)))
 
 
 class Station(NamedTuple):
@@ -203,10 +212,8 @@ def scene_points(options: SceneOptions, targets: Array, rng: np.random.Generator
     for _ in range(6):
         wave = rng.normal(size=2) * 4 / options.scene_size
         hills += np.sin(xy @ wave + rng.uniform(0, 2 * np.pi))
-    water = options.camera_height - options.interface_height
-    relief = options.relief if options.relief is not None else min(0.25 * options.scene_size, 0.7 * water)
     hills = (hills - hills.min()) / max(np.ptp(hills), 1e-12) - 0.5
-    z = options.camera_height + relief * (0.7 * hills + 0.3 * rng.uniform(-0.5, 0.5, options.num_points))
+    z = options.camera_height + options.floor_relief * (0.7 * hills + 0.3 * rng.uniform(-0.5, 0.5, options.num_points))
     pier = np.argsort(abs(xy[:, 0] - 0.5 * (low + high)[0]))[: round(options.dry_point_ratio * options.num_points)]
     above = 0.25 * np.hypot(*options.footprint) * _largest_slope(options)
     above = above + options.scene_size * rng.uniform(0.02, 0.08, len(pier))

@@ -52,11 +52,6 @@ class SessionOptions:
         if self.waves and self.scene.scenario == "camera_housing":
             raise RefractError("camera_housing looks through a port, which has no waves: leave them out")
 
-    @property
-    def water(self) -> float:
-        """Mean depth of the water, metres."""
-        return self.scene.camera_height - self.scene.interface_height
-
 
 @dataclass(frozen=True, kw_only=True)
 class Session:
@@ -67,8 +62,7 @@ class Session:
 
     def picture(self, index: int, *, num_threads: int = -1) -> Image:
         """The picture (H, W, 3) of one view."""
-        view = self.truth.view(self.truth.names[index])
-        seed = [self.options.scene.seed, index]
+        view, seed = self.truth.views[index], [self.options.scene.seed, index]
         return render(view, self.truth.terrain, self.texture, self.options.look, seed=seed, num_threads=num_threads)
 
     @cached_property
@@ -76,12 +70,9 @@ class Session:
         """The ground's, with a texel of half of what a pixel shows, or larger where it would have too many."""
         terrain = self.truth.terrain
         area = float(np.prod(terrain.high - terrain.low))
-        texel = max(0.5 * min(ground_sample_distance(view, terrain) for view in self._views), _least_texel(area))
+        finest = min(ground_sample_distance(view, terrain) for view in self.truth.views)
+        texel = max(0.5 * finest, float(np.sqrt(area / LARGEST_TEXTURE)))
         return stony_texture(terrain.low, terrain.high, texel=texel, seed=self.options.scene.seed + 1)
-
-    @property
-    def _views(self) -> list[View]:
-        return [self.truth.view(name) for name in self.truth.names]
 
 
 def photograph(options: SessionOptions) -> Session:
@@ -101,7 +92,7 @@ def photograph(options: SessionOptions) -> Session:
             layers=options.scene.layers,
             waves=options.waves,
             time=options.interval * station.frame,
-            water_depth=options.water,
+            water_depth=options.scene.water_depth,
         )
         pose = np.column_stack([station.rotation, station.translation])
         views.append(View(camera=station.camera, cam_from_world=pose, surface=surface))
@@ -160,10 +151,6 @@ def ground_sample_distance(view: View, terrain: Terrain) -> float:
     return float(np.sqrt(np.prod(np.linalg.norm(points[1:] - points[0], axis=1)))) if seen.all() else np.inf
 
 
-def _least_texel(area: float) -> float:
-    return float(np.sqrt(area / LARGEST_TEXTURE))
-
-
 def _interface_groups(options: SceneOptions, stations: list[scene.Station]) -> list[int]:
     """Which images share an interface: a number for each."""
     if options.scenario == "static_interface":
@@ -175,7 +162,7 @@ def _interface_groups(options: SceneOptions, stations: list[scene.Station]) -> l
 
 def _ground(options: SessionOptions, views: list[View]) -> Terrain:
     """A hilly ground that reaches a little farther than the edges of all views."""
-    relief = options.scene.relief if options.scene.relief is not None else 0.25 * options.water
+    relief = options.scene.relief if options.scene.relief is not None else 0.25 * options.scene.water_depth
     depth, size = options.scene.camera_height, options.scene.scene_size
     board = flat_board([-1e4 * size] * 2, [1e4 * size] * 2, depth + relief)
     border = []

@@ -54,7 +54,7 @@ class Truth:
         return trace(self.view(image_name), self.terrain, pixels)[0]
 
     def project(self, image_name: str, points: ArrayLike, *, near: ArrayLike | None = None) -> Array:
-        """The pixels (n, 2) at which points (n, 3) are seen; see `rendering.project`."""
+        """The pixels (n, 2) at which points (n, 3) are seen; see `view.project`."""
         return project(self.view(image_name), points, near=near)
 
     @property
