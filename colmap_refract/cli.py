@@ -5,11 +5,13 @@ from __future__ import annotations
 import functools
 import logging
 import operator
+import os
 import sys
 from typing import Annotated, Any
 
 import tyro
 
+from colmap_refract import __version__
 from colmap_refract.commands.automatic_reconstructor import AutomaticReconstructor
 from colmap_refract.commands.camera_calibrator import CameraCalibrator
 from colmap_refract.commands.flow_matcher import FlowMatcher
@@ -79,6 +81,9 @@ def main(arguments: list[str] | None = None) -> int:
         Exit status: 0, 1 for an error that is the user's to mend, 130 for Ctrl-C. A wrong command line exits with 2.
     """
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
+    if (sys.argv[1:] if arguments is None else arguments) == ["--version"]:
+        print(f"colmap-refract {__version__}")
+        return 0
     try:
         command = tyro.cli(
             _union(),
@@ -90,6 +95,11 @@ def main(arguments: list[str] | None = None) -> int:
             registry=_registry(),
         )
         command.run()
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Whoever read the output wants no more of it, as `head` does. Python would complain once more at its end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except RefractError as error:
         print(f"ERROR: {error}", file=sys.stderr)
         return 1

@@ -14,6 +14,9 @@ from colmap_refract.interface import Layers
 Scenario = Literal["moving_interface", "static_interface", "fixed_camera", "camera_housing"]
 Loss = Literal["trivial", "huber", "soft_l1", "cauchy"]
 
+_LEAST_INDEX, _LARGEST_INDEX = 0.25, 4.0
+"""Of one medium relative to another: beyond, a slip of the decimal point."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class BundleAdjustmentOptions:
@@ -37,6 +40,17 @@ class BundleAdjustmentOptions:
     """Of the solver, each time it runs."""
     function_tolerance: float = 1e-9
     """Relative change of the cost at which the solver stops."""
+
+    def __post_init__(self) -> None:
+        scale = self.loss_function_scale
+        if scale is not None and not 0 < scale < np.inf:
+            raise RefractError(f"loss_function_scale {scale:g} px is not positive")
+        if self.max_num_iterations < 1:
+            raise RefractError(f"max_num_iterations {self.max_num_iterations}: give 1 or more")
+        if not 0 <= self.function_tolerance < 1:
+            raise RefractError(
+                f"function_tolerance {self.function_tolerance:g}: give a small number from 0 on, e.g. 1e-9"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,11 +144,17 @@ class RefinerOptions:
                 f"initial_distance_ratio {self.initial_distance_ratio:g} puts the interface behind the camera or "
                 "beyond the points: give a fraction between 0 and 1"
             )
-        if self.filter_max_reproj_error < 0 or (self.filter_min_tri_angle or 0.0) < 0:
-            raise RefractError("filter_max_reproj_error and filter_min_tri_angle cannot be negative")
-        scale = self.BundleAdjustment.loss_function_scale
-        if scale is not None and not scale > 0:
-            raise RefractError(f"loss_function_scale {scale:g} px is not positive")
+        for name in ("filter_max_reproj_error", "filter_min_tri_angle"):
+            value = getattr(self, name)
+            if value is not None and not 0 <= value < np.inf:
+                raise RefractError(f"{name} {value:g}: give a number from 0 on; 0 keeps all")
+        for index in (self.refractive_index, *self.layer_refractive_index):
+            if not _LEAST_INDEX <= index <= _LARGEST_INDEX:
+                raise RefractError(f"a refractive index of {index:g} is no medium's: water has 1.333, glass 1.52")
+        if self.num_threads == 0 or self.num_threads < -1:
+            raise RefractError(f"num_threads {self.num_threads}: give 1 or more, or -1 for one per core")
+        if self.random_seed < 0:
+            raise RefractError(f"random_seed {self.random_seed}: give a number from 0 on")
 
     @property
     def layers(self) -> Layers:

@@ -10,7 +10,8 @@ from conftest import Scenes
 
 from colmap_refract.errors import RefractError
 from colmap_refract.interface import Layers
-from colmap_refract.options import BundleAdjustmentOptions, Scenario
+from colmap_refract.options import BundleAdjustmentOptions, RefinerOptions, Scenario
+from colmap_refract.refiner.refinement import refine
 from colmap_refract.simulation import ignore_refraction
 
 REFINED_UNDER_WATER = "look as if COLMAP had refined them"
@@ -62,11 +63,25 @@ def test_solver_that_stopped_early(scenes: Scenes, options: dict[str, Any], sent
     assert any(sentence in warning for warning in result.warnings)
 
 
-@pytest.mark.parametrize("scenario", ["static_interface", "moving_interface"])
-def test_nothing_refracted(scenes: Scenes, scenario: Scenario) -> None:
+@pytest.mark.parametrize("calibrated", [False, True])
+@pytest.mark.parametrize("scenario", ["static_interface", "moving_interface", "camera_housing"])
+def test_nothing_refracted(scenes: Scenes, scenario: Scenario, calibrated: bool) -> None:
+    """A solver finds some interface in any images; it must not be believed."""
     scene = scenes(scenario, layers=Layers(index=(1.0,)))
-    result = scene.refine(refractive_index=1.333)
-    assert any("Without refraction the model fits as well" in warning for warning in result.warnings)
+    cameras = dict(scene.model.cameras) if calibrated else None
+    try:
+        result = refine(scene.copy(), RefinerOptions(scenario=scenario), cameras=cameras)
+    except RefractError as error:
+        assert "the interface ran" in str(error)
+    else:
+        assert "Straight rays explain the images better" in result.warnings[0]
+
+
+@pytest.mark.parametrize("scenario", ["static_interface", "moving_interface", "camera_housing"])
+def test_refraction_that_is_there_is_believed(scenes: Scenes, scenario: Scenario) -> None:
+    doubts = ("Straight rays", "fits as well")
+    warnings = scenes(scenario).refined.warnings
+    assert not any(doubt in warning for warning in warnings for doubt in doubts)
 
 
 @pytest.mark.parametrize(

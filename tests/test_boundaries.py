@@ -39,7 +39,8 @@ LAYERS = [
     {"refiner.outcome"},
     {"refiner.refinement"},
     {"__init__"},
-    {"photographs.images", "frame_selection.options"},
+    {"photographs.silence", "frame_selection.options"},
+    {"photographs.images"},
     {"photographs.frames", "frame_selection.selection", "frame_selection.quality", "frame_selection.sparse_flow"},
     {
         "photographs.video", "frame_selection.fixed_camera", "frame_selection.looking",
@@ -96,6 +97,7 @@ LAYERS = [
         "commands.simulator",
     },
     {"cli"},
+    {"__main__"},
 ]  # fmt: skip
 """A module imports from earlier layers only."""
 

@@ -20,7 +20,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from colmap_refract.calibration.boards import Board, find_board
+from colmap_refract.calibration.boards import Board, describe_board, find_board
 from colmap_refract.calibration.search import find_boards
 from colmap_refract.commands.camera_calibrator import CameraCalibrator
 from colmap_refract.errors import RefractError
@@ -49,11 +49,16 @@ def camera_of(model: str) -> pycolmap.Camera:
     return pycolmap.Camera(camera_id=1, model=model, width=SIZE[0], height=SIZE[1], params=TRUTH[model])
 
 
-def chessboard(x: Array, y: Array) -> Array:
+def chessboard(x: Array, y: Array, columns: int = COLUMNS, rows: int = ROWS) -> Array:
     """Grey of a chessboard at places in squares, with a white rim a square wide."""
-    black = ((np.floor(x) + np.floor(y)) % 2 == 0) & (x >= 0) & (y >= 0) & (x < COLUMNS) & (y < ROWS)
-    paper = (x > -1) & (y > -1) & (x < COLUMNS + 1) & (y < ROWS + 1)
+    black = ((np.floor(x) + np.floor(y)) % 2 == 0) & (x >= 0) & (y >= 0) & (x < columns) & (y < rows)
+    paper = (x > -1) & (y > -1) & (x < columns + 1) & (y < rows + 1)
     return np.where(black, 30.0, np.where(paper, 225.0, GREY))
+
+
+def smaller_board(x: Array, y: Array) -> Array:
+    """A square less each way, as somebody has it who takes inner corners for squares."""
+    return chessboard(x, y, COLUMNS - 1, ROWS - 1)
 
 
 def charuco() -> Texture:
@@ -269,6 +274,43 @@ def test_other_boards_than_the_one_asked_for(images: Path, charucos: Photographs
     assert f"--dictionary DICT_5X5_50 --num_columns {COLUMNS} --num_rows {ROWS}" in line
 
 
+def test_another_board_in_most_images(images: Path, tmp_path: Path) -> None:
+    """Three views are enough to calibrate from, but not where most others show that another board was meant."""
+    small = photograph(tmp_path / "small", "OPENCV", smaller_board, True, 4).folder
+    sizes = {"num_columns": COLUMNS - 1, "num_rows": ROWS - 1}
+    for index in range(3):
+        (images / f"small_{index}.png").write_bytes((small / f"board_{index:02d}.png").read_bytes())
+    # Half of the images: nothing is said.
+    views, _ = find_boards(images, Board(kind="chessboard", **sizes), lambda _: None)
+    assert [view.name for view in views if len(view.xy)] == ["small_0.png", "small_1.png", "small_2.png"]
+    (images / "small_2.png").unlink()
+    line = fails(calibrator(images, tmp_path / "out", **sizes))
+    assert "only 2 of the 5 images" in line
+    assert f"--board chessboard --num_columns {COLUMNS} --num_rows {ROWS}" in line
+    # A smaller one in the others may be the part that they show of the one that was sought.
+    for index in range(2, 4):
+        (images / f"small_{index}.png").write_bytes((small / f"board_{index:02d}.png").read_bytes())
+    calibrator(images, tmp_path / "out", **FEW).run()
+
+
+def test_what_one_picture_of_many_shows_is_no_advice(images: Path, tmp_path: Path) -> None:
+    """Texture looks like some board now and then, not like the same one."""
+    for name in ("board_01.png", "board_02.png"):
+        cv2.imwrite(str(images / name), np.full(SIZE[::-1], 90, np.uint8))
+    line = fails(calibrator(images, tmp_path / "out", num_columns=COLUMNS - 1, num_rows=ROWS - 1))
+    assert "asks for" not in line and "white rim" in line
+
+
+def test_a_few_squares_are_no_board() -> None:
+    """Three by three corners are found among pebbles; four by three are a board, if others show them as well."""
+    board = Board(kind="chessboard", num_columns=COLUMNS, num_rows=ROWS)
+    down, across = np.mgrid[:400, :500] / 50 - 1.5
+    for columns, rows, size in ((4, 4, None), (5, 4, (5, 4))):
+        picture = np.asarray(chessboard(across, down, columns, rows), np.uint8)
+        likeness = describe_board(cv2.GaussianBlur(picture, (0, 0), 0.9), board)
+        assert (likeness and likeness.size) == size
+
+
 def test_no_board_at_all(tmp_path: Path) -> None:
     (tmp_path / "boards").mkdir()
     cv2.imwrite(str(tmp_path / "boards" / "sea.png"), np.full(SIZE[::-1], 90, np.uint8))
@@ -296,6 +338,16 @@ def test_folders_that_a_calibration_must_not_be_written_to(images: Path, tmp_pat
     (tmp_path / "model").mkdir()
     (tmp_path / "model" / "points3D.bin").write_bytes(b"of the user")
     assert "holds a COLMAP model" in fails(calibrator(images, tmp_path / "model", overwrite=True))
+    # Without a calibration of ours, nothing is mixed with what is there.
+    (tmp_path / "foreign").mkdir()
+    for name, text in (("notes.txt", "of the user"), ("calibration.json", '{"format": "of another program"}')):
+        (tmp_path / "foreign" / name).write_text(text)
+        for overwrite in (False, True):
+            line = fails(calibrator(images, tmp_path / "foreign", overwrite=overwrite))
+            assert "no earlier calibration" in line and "overwrite" not in line
+    (tmp_path / "empty").mkdir()
+    calibrator(images, tmp_path / "empty", **FEW, overwrite=True).run()
+    assert (tmp_path / "empty" / "cameras.txt").exists()
 
 
 def test_overwrite(images: Path, tmp_path: Path) -> None:
@@ -303,8 +355,9 @@ def test_overwrite(images: Path, tmp_path: Path) -> None:
     output.mkdir()
     for name in ("cameras.bin", "coverage.png", "notes.txt"):
         (output / name).write_bytes(b"earlier")
-    command = calibrator(images, output, **FEW)
-    assert "overwrite" in fails(command)
+    (output / "calibration.json").write_text('{"format": "colmap_refract calibration"}')
+    assert "holds an earlier calibration" in (line := fails(calibrator(images, output, **FEW)))
+    assert "--overwrite 1" in line
     calibrator(images, output, **FEW, overwrite=True).run()
     # An old cameras.bin would be read in place of the new cameras.txt.
     assert {path.name for path in output.iterdir()} == {"cameras.txt", "calibration.json", "coverage.png", "notes.txt"}
@@ -326,8 +379,13 @@ def test_a_full_disk(images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
         ({"board": "charuco", "dictionary": "DICT_9X9"}, "no dictionary 'DICT_9X9'"),
         ({"board": "charuco", "dictionary": "DICT_5X5_50", "num_columns": 20}, "70 markers"),
         ({"board": "charuco", "dictionary": DICTIONARY, "square_size": 0.03, "marker_size": 0.04}, "does not fit"),
-        ({"marker_size": 0.04}, "needs square_size"),
+        ({"board": "charuco", "dictionary": DICTIONARY, "marker_size": 0.04}, "needs square_size"),
+        ({"marker_size": 0.02, "square_size": 0.03}, "marker_size is of a charuco board"),
+        ({"dictionary": DICTIONARY}, "dictionary is of a charuco board"),
         ({"square_size": -1.0}, "not positive"),
+        # There are no images: these are told before any is looked for.
+        ({"max_view_error": 0.0}, "max_view_error 0 px is not positive"),
+        ({"max_view_error": float("nan")}, "max_view_error"),
     ],
 )
 def test_options_that_make_no_sense(tmp_path: Path, options: dict[str, object], words: str) -> None:

@@ -20,6 +20,7 @@ import pycolmap
 import pytest
 from conftest import Scene, Scenes
 
+import colmap_refract
 from colmap_refract.cli import main
 from colmap_refract.files.sidecar import read_sidecar
 from colmap_refract.simulation import SceneOptions, simulate
@@ -400,7 +401,13 @@ def test_damaged_models(run: Run, model: Path, tmp_path: Path, earlier: Path, da
         (["--initial_distance_ratio", "1.5"], "beyond the points"),
         (["--initial_distance_ratio", "-0.5"], "behind the camera"),
         (["--refine_interface_distance", "0"], "interface_distance"),
-        (["--filter_max_reproj_error", "-1"], "negative"),
+        (["--filter_max_reproj_error", "-1"], "from 0 on"),
+        (["--filter_min_tri_angle", "nan"], "from 0 on"),
+        (["--refractive_index", "13.33"], "no medium"),
+        (["--num_threads", "0"], "one per core"),
+        (["--random_seed", "-1"], "from 0 on"),
+        (["--BundleAdjustment.max_num_iterations", "0"], "1 or more"),
+        (["--BundleAdjustment.function_tolerance", "-1"], "small number"),
         (["--BundleAdjustment.loss_function_scale", "0"], "not positive"),
         (["--reference_image", "nobody.jpg"], "'nobody.jpg'"),
     ],
@@ -481,13 +488,40 @@ def test_camera_path_that_does_not_fit(run: Run, model: Path, tmp_path: Path) ->
     cameras = tmp_path / "cameras.txt"
     arguments = refiner(model, tmp_path / "out", "--camera_path", str(cameras))
     assert "does not exist" in run.fails(arguments)
-    cameras.write_text("1 SIMPLE_RADIAL 800 600 600 400 300 0\n")
+    cameras.write_text("1 SIMPLE_RADIAL 800 500 600 400 250 0\n")
     said = run.fails(arguments)
-    assert "1600 x 1200" in said and "800 x 600" in said
+    assert "1600 x 1200" in said and "800 x 500" in said
     cameras.write_text("3 PINHOLE 1600 1200 1 1 1 1\n7 PINHOLE 1600 1200 1 1 1 1\n")
     assert "no camera 1" in run.fails(arguments)
     cameras.write_text("1 PINHOLE 1600 1200 nan 1 1 1\n")
     assert "not finite" in run.fails(arguments)
+
+
+def test_camera_of_another_size_is_rescaled_and_that_is_said(run: Run, model: Path, tmp_path: Path) -> None:
+    camera = pycolmap.Reconstruction(model).camera(1)
+    camera.rescale(800, 600)
+    (tmp_path / "cameras.txt").write_text(
+        f"1 {camera.model.name} 800 600 {' '.join(map(repr, camera.params.tolist()))}\n"
+    )
+    plain = run(refiner(model, tmp_path / "plain"))
+    said = run(refiner(model, tmp_path / "out", "--camera_path", str(tmp_path / "cameras.txt")))
+    assert "rescaled to 1600 x 1200" in said and "rescaled" not in plain
+    a, b = (pycolmap.Reconstruction(tmp_path / name) for name in ("plain", "out"))
+    np.testing.assert_allclose(b.camera(1).params, a.camera(1).params, rtol=1e-9)
+
+
+def test_version(capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capfd.readouterr().out == f"colmap-refract {colmap_refract.__version__}\n"
+
+
+def test_a_reader_that_stops_reading(run: Run, model: Path, tmp_path: Path) -> None:
+    """As `colmap-refract model_analyzer ... | head` does."""
+    run(refiner(model, tmp_path / "out"))
+    command = f"{sys.executable} -m colmap_refract model_analyzer --path {tmp_path / 'out'}"
+    shell = f"{command} | true; echo ${{PIPESTATUS[0]}}"
+    piped = subprocess.run(["bash", "-c", shell], capture_output=True, text=True, check=True)
+    assert (piped.stdout, piped.stderr) == ("0\n", "")
 
 
 @pytest.mark.parametrize("how", ["same", "dots", "link"])

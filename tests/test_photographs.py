@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 import struct
 import sys
 from pathlib import Path
@@ -22,6 +24,7 @@ from colmap_refract.photographs.images import (
     list_images,
     read_gray,
 )
+from colmap_refract.photographs.silence import silence
 from colmap_refract.photographs.video import Video
 
 WIDTH, HEIGHT = 64, 48
@@ -252,7 +255,7 @@ def test_what_is_no_video(tmp_path: Path, damage: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".avi", ".mkv"])
-def test_video_that_breaks_off(tmp_path: Path, suffix: str) -> None:
+def test_video_that_breaks_off(tmp_path: Path, suffix: str, capfd: pytest.CaptureFixture[str]) -> None:
     """What is before the break can be used by an end before it, as the message says."""
     path = tmp_path / f"video{suffix}"
     write_video(path, [picture(k) for k in range(40)])
@@ -260,9 +263,56 @@ def test_video_that_breaks_off(tmp_path: Path, suffix: str) -> None:
     path.write_bytes(data[: len(data) // 2])
     message = error_of(lambda: list(Video(path).frames(5)))
     assert "breaks off" in message
+    assert capfd.readouterr().err == ""
+    # With a start after the break, or only a few frames before it, there is nothing to use.
+    assert "--end_time" not in error_of(lambda: list(Video(path, start_time=3.5).frames()))
+    (tmp_path / f"short{suffix}").write_bytes(data[: len(data) // 5])
+    few = error_of(lambda: list(Video(tmp_path / f"short{suffix}").frames()))
+    assert re.search(r"after \d of 40 frames", few) and "--end_time" not in few and "convert it" in few
     end = float(message.split("--end_time ")[1])
     assert 1.0 < end < 3.0
     assert len(list(Video(path, end_time=end).frames())) == pytest.approx(10 * end, abs=1.5)
+
+
+def test_decoders_say_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """What they think of damaged files would come between the lines of a report."""
+    video = tmp_path / "video.avi"
+    write_video(video, [picture(k) for k in range(20)])
+    data = bytearray(video.read_bytes())
+    noise = np.random.default_rng(0).integers(0, 256, len(data) // 2, dtype=np.uint8).tobytes()
+    video.write_bytes(data[: len(data) // 3] + noise + data[len(data) // 3 + len(noise) :])
+    for suffix in (".jpg", ".png"):
+        image = cv2.imencode(suffix, picture())[1].tobytes()
+        # Zeros before the end: libjpeg complains and goes on. A piece that is missing: libpng complains and stops.
+        spoiled = image[:-2] + bytes(50) + image[-2:] if suffix == ".jpg" else image[: len(image) // 2]
+        (tmp_path / f"image{suffix}").write_bytes(spoiled)
+    capfd.readouterr()
+    for path in (tmp_path / "image.jpg", tmp_path / "image.png"):
+        cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert "JPEG" in (said := capfd.readouterr().err) and "libpng" in said, "there is something to be silenced"
+    assert read_gray(tmp_path / "image.jpg").shape == (HEIGHT, WIDTH)
+    error_of(lambda: read_gray(tmp_path / "image.png"))
+    error_of(lambda: list(Video(video).frames()))
+    assert capfd.readouterr().err == ""
+    os.write(2, b"heard")
+    assert capfd.readouterr().err == "heard"
+
+
+def test_silence_ends_with_the_last_block(capfd: pytest.CaptureFixture[str]) -> None:
+    """Blocks that overlap, as those of threads do, leave by any order and by exceptions."""
+    before = len(os.listdir("/dev/fd")) if os.path.isdir("/dev/fd") else 0
+    first, second = silence(), silence()
+    first.__enter__()
+    second.__enter__()
+    first.__exit__(None, None, None)
+    os.write(2, b"unheard")
+    second.__exit__(None, None, None)
+    os.write(2, b"one ")
+    with pytest.raises(KeyboardInterrupt), silence():
+        raise KeyboardInterrupt
+    os.write(2, b"two")
+    assert capfd.readouterr().err == "one two"
+    assert (len(os.listdir("/dev/fd")) if os.path.isdir("/dev/fd") else 0) == before
 
 
 def test_folder_that_may_not_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -182,6 +182,13 @@ def test_a_model_is_judged_by_what_its_keypoints_show(scenario: Scenario) -> Non
     assert said.keypoint_noise == pytest.approx(0.2, rel=0.06)
     assert said.keypoint_rms == pytest.approx(0.2, rel=0.06)
     assert said.bound is not None and said.bound_best90 is not None
+    # Printed, the numbers have their units, and there are no arrays: a line for each, none of them long.
+    lines = str(said).splitlines()
+    assert 8 < len(lines) < 15 and max(map(len, lines)) < 100
+    assert f"{said.num_points} points" in lines[0] and all(": " in line for line in lines)
+    assert f"{1000 * said.rmse_best90:.3g} mm" in str(said) and f"{said.keypoint_noise:.3g} px" in str(said)
+    assert len(repr(said)) < 1000 and "point3D_ids" not in repr(said)
+    assert "Allowed" in str(said) and "Allowed" not in str(replace(said, bound=None, bound_best90=None))
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)
@@ -282,7 +289,8 @@ def test_waves_shift_keypoints_by_their_slope() -> None:
 
 
 def run(tmp_path: Path, **options: Any) -> None:
-    Simulator(scenario=options.pop("scenario", "static_interface"), num_points=80, compare=False, **options).run()
+    usual = {"scenario": "static_interface", "num_points": 80, "compare": False}
+    Simulator(**{**usual, **options}).run()
 
 
 def test_the_command_plans_and_renders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -318,7 +326,17 @@ def test_the_command_plans_and_renders(tmp_path: Path, capsys: pytest.CaptureFix
         ({"wave_amplitude": (0.01,)}, "wavelength"),
         ({"wave_amplitude": (0.5,), "wavelength": (0.5,)}, "break"),
         ({"scenario": "camera_housing", "wave_amplitude": (0.01,), "wavelength": (0.5,)}, "no waves"),
-        ({"relief": -0.1}, "relief"),
+        ({"num_images": 0}, "num_images 0 is too few images: give two or more$"),
+        ({"num_points": 3}, "num_points 3 is too few"),
+        ({"relief": -0.1}, "relief of -0.1 m is negative"),
+        ({"relief": 100.0}, "reaches out of the water"),
+        ({"relief": np.nan}, "relief"),
+        ({"seed": -1}, "seed -1 is negative"),
+        ({"seed": -1, "wave_amplitude": (0.01,), "wavelength": (1.0,)}, "seed -1 is negative"),
+        ({"interval": -1.0}, "interval -1 s"),
+        ({"num_threads": 0}, "num_threads 0"),
+        ({"num_threads": -2}, "num_threads -2"),
+        ({"scenario": "fixed_camera", "layout": "strip"}, "no path"),
         ({"jpeg_quality": 0}, "jpeg_quality"),
         ({"interval": np.inf}, "interval"),
         ({"scenario": "moving_interface", "interface_distance": 0.05, "tilt_deg": 30.0}, "interface|surface"),

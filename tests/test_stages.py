@@ -26,7 +26,7 @@ from conftest import Scenes
 from colmap_refract.errors import RefractError
 from colmap_refract.options import ImageNotes, RefinerOptions
 from colmap_refract.reconstructor import colmap_options, colmap_process, features, flow, matches, models
-from colmap_refract.reconstructor.calibration import assign_cameras, fit_to_size
+from colmap_refract.reconstructor.calibration import assign_cameras, fitted_camera
 from colmap_refract.reconstructor.colmap_process import run_colmap
 from colmap_refract.reconstructor.contents import fingerprint, read_contents
 from colmap_refract.reconstructor.options import MapperOptions, ReconstructorOptions, TwoViewGeometryOptions
@@ -228,7 +228,7 @@ def camera_of(model: str = "PINHOLE", size: tuple[int, int] = SIZE, camera_id: i
 @pytest.mark.parametrize("model", MODELS)
 def test_rescaled_camera_sees_the_same_scaled(model: str) -> None:
     camera = camera_of(model)
-    fitted, remark = fit_to_size(camera, (1000, 750))
+    fitted, remark = fitted_camera(camera, (1000, 750))
     points = np.array([[0.1, -0.2, 1.0], [0.4, 0.3, 1.2], [-0.3, 0.1, 0.8]])
     # Exactly: pixels are lengths on the sensor, whose corner is (0, 0) at every size.
     np.testing.assert_allclose(fitted.img_from_cam(points), 2.5 * np.array(camera.img_from_cam(points)), rtol=1e-12)
@@ -239,14 +239,14 @@ def test_rescaled_camera_sees_the_same_scaled(model: str) -> None:
 
 @pytest.mark.parametrize("size", [SIZE, (800, 600), (801, 600), (800, 602)])
 def test_shapes_that_fit(size: tuple[int, int]) -> None:
-    fitted, remark = fit_to_size(camera_of(), size)
+    fitted, remark = fitted_camera(camera_of(), size)
     assert (fitted.width, fitted.height) == size and bool(remark) == (size != SIZE)
 
 
 @pytest.mark.parametrize("size", [(800, 610), (640, 360), (300, 400), (790, 600)])
 def test_shapes_that_do_not_fit(size: tuple[int, int]) -> None:
     with pytest.raises(RefractError, match=f"{size[0]} x {size[1]}.*400 x 300") as caught:
-        fit_to_size(camera_of(), size)
+        fitted_camera(camera_of(), size)
     assert ("turn the images" in str(caught.value)) == (size == (300, 400))
 
 

@@ -27,6 +27,7 @@ DICTIONARIES = sorted({name.upper() for name in dir(cv2.aruco) if name.startswit
 
 _FIND_SIZE = 1600  # px, the longer side at which a chessboard is sought first
 _FEWEST_MARKERS = 4  # that are no accident
+_FEWEST_CORNERS = 12  # of a chessboard of unknown size; 3 x 3 are found wherever there is texture
 _USUAL_MARKER = 0.75  # of a square; it only sets the window in which a corner is located
 
 
@@ -117,15 +118,43 @@ def find_board(gray: Gray, board: Board, name: str) -> View:
     return View(name=name, corner_idxs=idxs, xy=xy + 0.5)
 
 
-def describe_board(gray: Gray, board: Board) -> str | None:
-    """The board that a picture shows in place of the one that was sought: a few words on how to ask for it.
+@dataclass(frozen=True, kw_only=True)
+class Likeness:
+    """What a picture shows in place of the board that was sought.
+
+    Attributes:
+        kind: of the board.
+        dictionary: of its markers, None of a chessboard.
+        size: squares along a row and along a column, None if only markers were recognised.
+    """
+
+    kind: BoardKind
+    dictionary: str | None = None
+    size: tuple[int, int] | None = None
+
+    @property
+    def options(self) -> str:
+        """The options that ask for it."""
+        words = f"--board {self.kind}"
+        if self.dictionary is not None:
+            words += f" --dictionary {self.dictionary}"
+        if self.size is not None:
+            words += f" --num_columns {self.size[0]} --num_rows {self.size[1]}"
+        return words
+
+
+def describe_board(gray: Gray, board: Board) -> Likeness | None:
+    """The board that a picture shows in place of the one that was sought.
+
+    A single picture proves little: three by three dark and light spots are soon found among pebbles, and of a board
+    that reaches out of the picture only a part is seen.
 
     Args:
         gray: (H, W), in which `board` was not found.
         board: that was sought.
 
     Returns:
-        The options that would find what is there, None if nothing was recognised.
+        What is there, None if nothing was recognised.
     """
     small, _ = _reduced(gray)
     # In the order of what is likely: each of these takes about a second.
@@ -134,18 +163,18 @@ def describe_board(gray: Gray, board: Board) -> str | None:
     return _describe_charuco(small, board) or _describe_chessboard(small, board)
 
 
-def _describe_chessboard(gray: Gray, board: Board) -> str | None:
+def _describe_chessboard(gray: Gray, board: Board) -> Likeness | None:
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
     found, _, kinds = cv2.findChessboardCornersSBWithMeta(gray, (3, 3), flags)
-    if not found:
+    if not found or kinds.size < _FEWEST_CORNERS:
         return None
-    rows, columns = np.add(kinds.shape, 1)
+    rows, columns = (length + 1 for length in kinds.shape)
     if (columns < rows) != (board.num_columns < board.num_rows):
         columns, rows = rows, columns
-    return f"--board chessboard --num_columns {columns} --num_rows {rows}"
+    return Likeness(kind="chessboard", size=(columns, rows))
 
 
-def _describe_charuco(gray: Gray, board: Board) -> str | None:
+def _describe_charuco(gray: Gray, board: Board) -> Likeness | None:
     dictionary = board.dictionary
     if dictionary is None or _count_markers(gray, dictionary) < _FEWEST_MARKERS:
         counts = {name: _count_markers(gray, name) for name in sorted(DICTIONARIES, key=_dictionary_size)}
@@ -157,11 +186,8 @@ def _describe_charuco(gray: Gray, board: Board) -> str | None:
         if columns * rows <= 2 * _dictionary_size(dictionary):
             other = Board(kind="charuco", num_columns=columns, num_rows=rows, dictionary=dictionary)
             found[columns, rows] = len(_find_charuco(gray, other)[0])
-    words = f"--board charuco --dictionary {dictionary}"
-    if any(found.values()):
-        columns, rows = max(found, key=lambda size: found[size])
-        words += f" --num_columns {columns} --num_rows {rows}"
-    return words
+    size = max(found, key=lambda size: found[size]) if any(found.values()) else None
+    return Likeness(kind="charuco", dictionary=dictionary, size=size)
 
 
 def _find_chessboard(gray: Gray, board: Board) -> tuple[NDArray[np.int64], Array]:

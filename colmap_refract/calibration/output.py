@@ -29,8 +29,10 @@ from colmap_refract.calibration.coverage import CORNER_NAMES, Coverage, Verdict
 from colmap_refract.calibration.picture import draw_coverage
 from colmap_refract.errors import RefractError
 from colmap_refract.files.model_files import MODEL_FILES
+from colmap_refract.files.output import WORK_PREFIX
 from colmap_refract.files.sidecar import SIDECAR_NAME
 
+FORMAT = "colmap_refract calibration"
 CAMERAS_NAME, JSON_NAME, PICTURE_NAME = "cameras.txt", "calibration.json", "coverage.png"
 
 
@@ -62,14 +64,41 @@ class Outcome:
         )
 
 
-def check_folder(path: Path, image_path: Path) -> None:
-    """Raise a RefractError if a calibration has no place in a folder: among images, or in a COLMAP model."""
+def check_folder(path: Path, image_path: Path, *, overwrite: bool) -> None:
+    """Raise a RefractError if a calibration has no place in a folder: among images, in a COLMAP model, among files of
+    another kind, or in place of an earlier calibration without `overwrite`."""
     target, source = path.resolve(), image_path.resolve()
     if target != source and source in target.parents:
         raise RefractError(f"the output folder {path} is among the images; choose one outside of {image_path}")
     for name in (*MODEL_FILES, SIDECAR_NAME):
         if not name.startswith("cameras.") and (path / name).exists():
             raise RefractError(f"the output folder {path} holds a COLMAP model; choose another for the calibration")
+    if target == source or not _is_used(target):
+        return
+    if not _is_calibration(target):
+        raise RefractError(
+            f"the output folder {path} is not empty, and what is in it is no earlier calibration; choose another"
+        )
+    if not overwrite:
+        raise RefractError(
+            f"the output folder {path} holds an earlier calibration; choose another, or have it replaced "
+            "(--overwrite 1)"
+        )
+
+
+def _is_used(folder: Path) -> bool:
+    """Whether there is anything in a folder but what a killed run left; what cannot be read is refused later."""
+    try:
+        return any(not inside.name.startswith(WORK_PREFIX) for inside in folder.iterdir())
+    except OSError:
+        return False
+
+
+def _is_calibration(folder: Path) -> bool:
+    try:
+        return bool(json.loads((folder / JSON_NAME).read_text(encoding="utf-8"))["format"] == FORMAT)
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
 
 
 def write_calibration(outcome: Outcome, folder: Path) -> None:
@@ -98,7 +127,7 @@ def _contents(outcome: Outcome) -> dict[str, Any]:
     calibration, coverage = outcome.calibration, outcome.coverage
     camera, side = calibration.camera, outcome.square_size
     return {
-        "format": "colmap_refract calibration",
+        "format": FORMAT,
         "version": 1,
         "camera": {
             "model": camera.model.name,

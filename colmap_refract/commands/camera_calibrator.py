@@ -58,6 +58,13 @@ class CameraCalibrator:
         for name, value in (("square_size", self.square_size), ("marker_size", self.marker_size)):
             if value is not None and not 0 < value < float("inf"):
                 raise RefractError(f"{name} {value:g} is not positive; give metres")
+        if self.max_view_error is not None and not self.max_view_error > 0:
+            raise RefractError(
+                f"max_view_error {self.max_view_error:g} px is not positive; leave it out for the default"
+            )
+        for name, given in (("marker_size", self.marker_size), ("dictionary", self.dictionary)):
+            if given is not None and self.board == "chessboard":
+                raise RefractError(f"{name} is of a charuco board; leave it out, or give --board charuco")
         if self.marker_size is not None and self.square_size is None:
             raise RefractError("marker_size needs square_size beside it")
 
@@ -76,7 +83,7 @@ class CameraCalibrator:
             marker_size=self.marker_size / self.square_size if self.marker_size and self.square_size else None,
             dictionary=self.dictionary,
         )
-        check_folder(self.output_path, self.image_path)
+        check_folder(self.output_path, self.image_path, overwrite=self.overwrite)
         with (
             output_folder(self.output_path, input_path=self.image_path, overwrite=self.overwrite) as folder,
             ProgressLine() as line,

@@ -38,7 +38,7 @@ class FlowMatcher:
         from colmap_refract.files.cameras_file import read_cameras
         from colmap_refract.mapping.flow_database import calibrated_camera, check_new_database, create_flow_database
         from colmap_refract.optical_flow.reference import check_names, choose_reference
-        from colmap_refract.optical_flow.report import flow_report
+        from colmap_refract.optical_flow.report import flow_report, lost_warning
         from colmap_refract.optical_flow.tracking import track_against_reference
         from colmap_refract.photographs.images import Gray, image_size, list_images, read_gray
 
@@ -59,4 +59,6 @@ class FlowMatcher:
         if camera is None:
             logger.warning("the intrinsics are COLMAP's guess; calibrate the camera in air and give camera_path")
         print(flow_report(tracks))
+        if warning := lost_warning(tracks):
+            print(f"\nWARNING: {warning}")
         print(f"\nWritten to {self.database_path}")

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
 from colmap_refract.commands.progress import ProgressLine
+from colmap_refract.errors import RefractError
 from colmap_refract.options import Scenario
 
 
@@ -42,6 +44,8 @@ class InitialMapper:
         from colmap_refract.mapping.initial import initial_model_from_database
         from colmap_refract.mapping.initial_report import report
 
+        if self.random_seed < 0:
+            raise RefractError(f"random_seed {self.random_seed}: give a number from 0 on")
         with output_folder(self.output_path, input_path=None, overwrite=self.overwrite) as folder:
             cameras = read_cameras(self.camera_path) if self.camera_path is not None else None
             with ProgressLine() as line:
@@ -56,4 +60,20 @@ class InitialMapper:
                 )
             write_model(result.reconstruction, folder)
         print(report(result))
-        print(f"\nWritten to {self.output_path}; next: colmap-refract refiner --input_path {self.output_path}")
+        print(f"\nWritten to {self.output_path}; next:\n{self._next()}")
+
+    def _next(self) -> str:
+        """The command that refines the model, to be pasted into a shell."""
+        refined = self.output_path.absolute().with_name(f"{self.output_path.absolute().name}_refined")
+        if not self.output_path.is_absolute():
+            refined = self.output_path.parent / refined.name
+        arguments: dict[str, object] = {
+            "input_path": self.output_path,
+            "output_path": refined,
+            "scenario": self.scenario,
+            "database_path": self.database_path,
+        }
+        if self.reference_image:
+            arguments["reference_image"] = self.reference_image
+        options = (f"--{name} {shlex.quote(str(value))}" for name, value in arguments.items())
+        return " ".join(["colmap-refract refiner", *options])

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from colmap_refract.errors import RefractError
+from colmap_refract.errors import RefractError, reason_of
 
 
 def _read_lines(path: Path) -> list[str]:
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise RefractError(f"{path} cannot be read ({error}); give a text file") from None
+        reason = "it is no text" if isinstance(error, UnicodeDecodeError) else reason_of(error)
+        raise RefractError(f"{path} cannot be read ({reason}); give a text file") from None
     return [line.strip() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
 
 

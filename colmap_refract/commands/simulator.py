@@ -36,7 +36,7 @@ class Simulator:
     """What is shared (see refiner). Of a housing, the interface is the port."""
     layout: Layout = "orbit"
     """Path of the camera. orbit: every image sees the same scene.
-    strip and survey: one line or several, and each image sees its own part."""
+    strip and survey: one line or several, and each image sees its own part. Not of a fixed camera."""
     num_images: int = 15
     """Images taken."""
     output_path: Path | None = None
@@ -92,7 +92,7 @@ class Simulator:
     jpeg_quality: int = 90
     """Of the rendered images, 1 to 100."""
     num_threads: int = -1
-    """Of the rendering; -1: as many as there are cores."""
+    """Of the rendering, 1 or more; -1: as many as there are cores."""
 
     def run(self) -> None:
         """Plan, report, render."""
@@ -146,6 +146,10 @@ class Simulator:
         for name, value in {"oblique_deg": self.oblique_deg, "tilt_deg": self.tilt_deg}.items():
             if not 0 <= value < 60:
                 raise RefractError(f"{name} {value:g} is not from 0 to 60 degrees")
+        if self.num_threads < 1 and self.num_threads != -1:
+            raise RefractError(f"num_threads {self.num_threads} is no number of threads: give 1 or more, or -1 for all")
+        if self.scenario == "fixed_camera" and self.layout != "orbit":
+            raise RefractError(f"a fixed camera has no path: leave layout {self.layout} out")
         camera = self._camera()
         depth = distance + self.water_depth
         return SessionOptions(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import struct
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,6 +17,8 @@ from colmap_refract.files.text_files import is_comment, lines_of
 if TYPE_CHECKING:
     import pycolmap
 
+MAX_ASPECT_CHANGE = 0.005
+"""Relative; more is a crop or another sensor mode, of which the principal point is not known."""
 CAMERA = struct.Struct("<IiQQ")  # the fixed part of a camera's record
 
 
@@ -42,6 +45,36 @@ def read_cameras(path: str | Path) -> dict[int, pycolmap.Camera]:
                 raise RefractError(f"{file} holds neither cameras.bin nor cameras.txt; give a COLMAP cameras file")
             file = found[0]
         return cameras_from_binary(file) if file.suffix == ".bin" else cameras_from_text(file)
+
+
+def fit_to_size(camera: pycolmap.Camera, width: int, height: int) -> pycolmap.Camera:
+    """A copy of calibrated intrinsics for images of another size; the flag says that they are known.
+
+    Focal lengths and principal point go with the width and the height; distortion parameters act on directions
+    and stay.
+
+    Raises:
+        RefractError: the images have another shape than those of the calibration.
+    """
+    fitted = copy.deepcopy(camera)
+    fitted.has_prior_focal_length = True
+    if (camera.width, camera.height) == (width, height):
+        return fitted
+
+    def like(known_width: int, known_height: int) -> bool:
+        return abs(width * known_height / (height * known_width) - 1) <= MAX_ASPECT_CHANGE
+
+    if not like(camera.width, camera.height):
+        turned = like(camera.height, camera.width)
+        hint = (
+            "turn the images as the camera took them" if turned else "calibrate with uncropped images of the same mode"
+        )
+        raise RefractError(
+            f"the images have {width} x {height} pixels, the calibration is for {camera.width} x {camera.height}, "
+            f"another shape; {hint}"
+        )
+    fitted.rescale(width, height)
+    return fitted
 
 
 def cameras_from_binary(file: Path) -> dict[int, pycolmap.Camera]:

@@ -27,6 +27,7 @@ from colmap_refract.files.model_files import (
     readable,
 )
 from colmap_refract.files.quiet import quiet_pycolmap
+from colmap_refract.files.sidecar import SIDECAR_NAME
 from colmap_refract.files.text_files import tables_from_text
 
 if TYPE_CHECKING:
@@ -145,9 +146,11 @@ def _find_model(folder: Path) -> str:
         found = [name for name in MODEL_FILES if (folder / name).is_file()]
         if found:
             raise RefractError(f"{message}, only {', '.join(found)}; add the missing files")
-        inside = [p for pattern in ("*", "sparse/*") for p in sorted(folder.glob(pattern)) if _model_suffix(p)]
+        patterns = ("*", "sparse_refractive/*", "sparse/*")
+        inside = [p for pattern in patterns for p in sorted(folder.glob(pattern)) if _model_suffix(p)]
         if inside:
-            message += f"; did you mean {' or '.join(map(str, inside[:3]))}?"
+            shown = (f"{p}{' (refined)' if (p / SIDECAR_NAME).is_file() else ''}" for p in inside[:3])
+            message += f"; did you mean {' or '.join(shown)}?"
         else:
             message += "; give the folder that COLMAP's mapper wrote, such as sparse/0"
         raise RefractError(message)

@@ -106,7 +106,7 @@ def _check_output(path: Path, target: Path, input_path: str | Path | None, overw
     if not overwrite and any(not inside.name.startswith(WORK_PREFIX) for inside in target.iterdir()):
         raise RefractError(
             f"the output folder {path} is not empty; choose another, or have what an earlier run wrote replaced "
-            "(--overwrite)"
+            "(--overwrite 1)"
         )
 
 

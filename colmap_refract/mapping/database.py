@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import os
 import sqlite3
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -81,50 +80,43 @@ def open_database(path: str | Path) -> Iterator[pycolmap.Database]:
 
 
 @contextmanager
-def read_database(path: str | Path) -> Iterator[pycolmap.Database]:
-    """A COLMAP database to read only: one that COLMAP would bring up to date, or cannot write to, stays as it is.
+def read_database(path: str | Path, *, without: Collection[str] = ("descriptors",)) -> Iterator[pycolmap.Database]:
+    """A temporary copy of a COLMAP database, which itself stays as it is, byte for byte.
 
-    Of such a one a temporary copy is opened, without the descriptors, which are its bulk.
+    COLMAP alters every database that it opens: it brings it up to date, and turns on write-ahead logging.
+
+    Args:
+        path: the database.
+        without: tables that are empty in the copy; the descriptors are the bulk.
 
     Raises:
         RefractError: there is none at the path, it is none of COLMAP's, or there is no room for the copy.
     """
     path = Path(path)
     check_database(path)
-    with ExitStack() as stack:
-        if _version(path) != _version_of_new() or not (os.access(path, os.W_OK) and os.access(path.parent, os.W_OK)):
-            folder = Path(stack.enter_context(TemporaryDirectory(prefix="colmap_refract-")))
-            path = _copy_without_descriptors(path, folder / "database.db")
-        yield stack.enter_context(open_database(path))
+    with TemporaryDirectory(prefix="colmap_refract-") as folder:
+        copy = Path(folder) / "database.db"
+        copy_database(path, copy, without=without)
+        with open_database(copy) as database:
+            yield database
 
 
-def _read_only_uri(path: Path) -> str:
-    # Where SQLite cannot put its files for sharing beside a database, nobody else can be writing to it either.
-    shared = os.access(path.resolve().parent, os.W_OK)
-    return f"{path.resolve().as_uri()}?{'mode=ro' if shared else 'immutable=1'}"
-
-
-def _read_only(path: Path) -> sqlite3.Connection:
+def read_only(path: Path) -> sqlite3.Connection:
+    """A database in SQLite, to be read by this process alone; no files appear beside one that nobody is writing to."""
     return sqlite3.connect(_read_only_uri(path), uri=True)
 
 
-def _version(path: Path) -> int:
-    with closing(_read_only(path)) as connection:
-        return int(connection.execute("PRAGMA user_version").fetchone()[0])
+def _read_only_uri(path: Path) -> str:
+    path = path.resolve()
+    # Of a database with write-ahead logging, SQLite leaves files for sharing behind if it may not write. They are
+    # there while somebody else writes. Where they cannot be put beside a database, nobody can be writing to it.
+    written = any(os.path.exists(f"{path}{suffix}") for suffix in ("-wal", "-journal"))
+    shared = written and os.access(path.parent, os.W_OK)
+    return f"{path.as_uri()}?{'mode=ro' if shared else 'immutable=1'}"
 
 
-@cache
-def _version_of_new() -> int:
-    """What COLMAP stamps a database with."""
-    import pycolmap
-
-    with TemporaryDirectory(prefix="colmap_refract-") as folder:
-        path = Path(folder) / "database.db"
-        pycolmap.Database.open(path).close()
-        return _version(path)
-
-
-def _copy_without_descriptors(source: Path, copy: Path) -> Path:
+def copy_database(source: Path, copy: Path, *, without: Collection[str] = ("descriptors",)) -> None:
+    """Copy a database to where none is; see `read_database`."""
     try:
         with closing(sqlite3.connect(copy.as_uri(), uri=True)) as connection:
             connection.execute("ATTACH ? AS source", (_read_only_uri(source),))
@@ -133,7 +125,7 @@ def _copy_without_descriptors(source: Path, copy: Path) -> Path:
             ).fetchall()
             for name, sql in tables:
                 connection.execute(sql)
-                if name != "descriptors":
+                if name not in without:
                     connection.execute(f'INSERT INTO main."{name}" SELECT * FROM source."{name}"')
             version = int(connection.execute("PRAGMA source.user_version").fetchone()[0])
             connection.execute(f"PRAGMA main.user_version = {version}")
@@ -142,15 +134,16 @@ def _copy_without_descriptors(source: Path, copy: Path) -> Path:
         raise RefractError(
             f"{source} cannot be copied to {copy.parent} to be read ({error}); make room there"
         ) from None
-    return copy
 
 
 def check_database(path: Path) -> None:
     """Raise RefractError unless there is a COLMAP database at the path; it is not altered."""
+    if not os.path.lexists(path):
+        raise RefractError(f"{path} does not exist: give the database.db of a COLMAP project")
     if not path.is_file():
         raise RefractError(f"{path} is no database file: give the database.db of a COLMAP project")
     try:
-        with closing(_read_only(path)) as connection:
+        with closing(read_only(path)) as connection:
             tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     except sqlite3.Error as error:
         raise RefractError(f"{path} cannot be read as a database ({error}); copy it again, or make a new one") from None

@@ -20,8 +20,8 @@ def report(initial: InitialModel) -> str:
         _row("Mean reprojection error", f"{model.compute_mean_reprojection_error():.3g} px without refraction"),
     ]
     if initial.reliability is not None:
-        relief = f"one, and a relief of which {100 * initial.reliability:.0f} % is no noise"
-        lines.append(_row("Depths", relief if initial.reliability else "one for all points"))
+        relief = f"a relief about one depth, reliability {initial.reliability:.2f} (1: two halves of the images agree)"
+        lines.append(_row("Depths", relief if initial.reliability else "one for all points: no relief stands out"))
     lines += ["", f"{'Pairs of images averaged':44s}{'points':>10s}{'angle [deg]':>15s}", "-" * _WIDTH]
     lines += [
         f"{f'{pair.first}, {pair.second}':44s}{pair.num_points:10d}{pair.angle_deg:15.3g}"

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_refract.errors import RefractError
+from colmap_refract.files.cameras_file import fit_to_size
 from colmap_refract.mapping.database import Correspondences, read_database
 from colmap_refract.mapping.tracks import Tracks
 from colmap_refract.refiner.observations import Observations, lift
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
     import pycolmap
 
 Mask = NDArray[np.bool_]
+
+_BULK = ("descriptors", "keypoints", "matches", "two_view_geometries")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +66,7 @@ def read_unposed_model(
     """
     import pycolmap
 
-    with read_database(path) as database:
+    with read_database(path, without=_BULK) as database:
         rigs, frames = database.read_all_rigs(), database.read_all_frames()
     used = {int(correspondences.camera_ids[c]) for c in correspondences.image_camera}
     model = pycolmap.Reconstruction()
@@ -163,22 +166,14 @@ def put_into_model(model: pycolmap.Reconstruction, start: Posed) -> pycolmap.Rec
 
 
 def _calibrated(camera: pycolmap.Camera, cameras: Mapping[int, pycolmap.Camera]) -> pycolmap.Camera:
-    import pycolmap
-
     known = next(iter(cameras.values())) if len(cameras) == 1 else cameras.get(camera.camera_id)
     if known is None:
         raise RefractError(
             f"the given intrinsics have no camera {camera.camera_id}, which the database uses; they have "
             f"{', '.join(str(i) for i in sorted(cameras))}"
         )
-    if (known.width, known.height) != (camera.width, camera.height):
-        raise RefractError(
-            f"camera {camera.camera_id} takes images of {camera.width} x {camera.height} px, the given intrinsics are "
-            f"for {known.width} x {known.height} px: calibrate at the size of the images"
-        )
-    calibrated = pycolmap.Camera(known.todict())
+    calibrated = fit_to_size(known, camera.width, camera.height)
     calibrated.camera_id = camera.camera_id
-    calibrated.has_prior_focal_length = True
     return calibrated
 
 

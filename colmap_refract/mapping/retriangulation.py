@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -78,7 +78,7 @@ def refine_with_database(
     """
     check_keypoints(reconstruction, correspondences)
     result = refine(reconstruction, options, notes=notes, cameras=cameras, watch=watch)
-    before, gained = result.sidecar.statistics, Gain()
+    rounds, gained = [result.sidecar.statistics], Gain()
     options = replace(options, reference_image=str(result.sidecar.solver["reference_image"]))
     for _ in range(_MAX_ROUNDS):
         model, gain = complete_model(result.reconstruction, result.sidecar, correspondences, options)
@@ -91,21 +91,27 @@ def refine_with_database(
         if again.reconstruction.compute_num_observations() <= num_observations and not gain.num_merged:
             break
         result, gained = again, gained + gain
-    _restate(result.sidecar, before, gained)
+        rounds.append(again.sidecar.statistics)
+    result.sidecar.statistics.update(_of_the_whole(rounds, gained))
     return result
 
 
-def _restate(sidecar: Sidecar, before: dict[str, object], gained: Gain) -> None:
-    """Statistics of the whole: before it all, not before its last part."""
-    statistics = sidecar.statistics
-    seconds = {key: statistics[key] + before[key] for key in ("solve_seconds", "total_seconds")}
-    if statistics is not before:
-        statistics.update({key: value for key, value in before.items() if key.endswith("_before")}, **seconds)
-    statistics.update(
-        num_completed_observations=gained.num_completed,
-        num_merged_points3D=gained.num_merged,
-        num_created_points3D=gained.num_created,
-    )
+_SUMMED = ("num_filtered_large_error", "num_filtered_small_angle", "solve_seconds", "total_seconds")
+
+
+def _of_the_whole(rounds: list[dict[str, Any]], gained: Gain) -> dict[str, Any]:
+    """Statistics from before the first round to after the last."""
+    first, last = rounds[0], rounds[-1]
+    before = {key: value for key, value in first.items() if key.endswith("_before")}
+    left = before["num_points3D_before"] + gained.num_created - gained.num_merged - last["num_points3D"]
+    return {
+        **before,
+        **{key: sum(statistics[key] for statistics in rounds) for key in _SUMMED},
+        "num_completed_observations": gained.num_completed,
+        "num_merged_points3D": gained.num_merged,
+        "num_created_points3D": gained.num_created,
+        "num_dissolved_points3D": left,
+    }
 
 
 def check_keypoints(reconstruction: pycolmap.Reconstruction, correspondences: Correspondences) -> None:

@@ -7,6 +7,16 @@ from colmap_refract.optical_flow.tracking import FlowTracks
 _WIDTH = 78
 
 
+def lost_warning(tracks: FlowTracks) -> str:
+    """A sentence for the user where most frames are lost; '' otherwise."""
+    if 2 * len(tracks.lost) <= len(tracks.frames):
+        return ""
+    return (
+        f"most frames could not be followed ({len(tracks.lost)} of {len(tracks.frames)}): if the camera moves, this is "
+        "not the tool: use feature matching"
+    )
+
+
 def flow_report(tracks: FlowTracks) -> str:
     """A line per frame; lengths in pixels. Names longer than fit are cut at their beginning."""
     lines = [

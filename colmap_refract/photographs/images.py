@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_refract.errors import RefractError
+from colmap_refract.photographs.silence import silence
 
 Gray: TypeAlias = NDArray[np.uint8]
 """Shape (H, W), 0 is black."""
@@ -121,13 +122,11 @@ def _decode(path: Path, flags: int) -> NDArray[Any]:
         data = np.fromfile(path, np.uint8)
     except OSError as error:
         raise RefractError(f"the image {path} cannot be read ({error.strerror}); remove or replace it") from None
-    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the error below says it in one line
     try:
-        image = cv2.imdecode(data, flags | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
+        with silence():  # the error below says it in one line
+            image = cv2.imdecode(data, flags | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
     except cv2.error:
         image = None
-    finally:
-        cv2.utils.logging.setLogLevel(level)
     if image is None:
         raise RefractError(f"the image {path} cannot be decoded; remove or replace it")
     return np.asarray(image)

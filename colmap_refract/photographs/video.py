@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,12 +16,18 @@ import numpy as np
 from colmap_refract.errors import RefractError
 from colmap_refract.photographs.frames import Frame
 from colmap_refract.photographs.images import Gray
+from colmap_refract.photographs.silence import silence
 
 FrameFormat = Literal["png", "jpg"]
+
+# FFmpeg's decoders have threads of their own, which `silence` about single calls does not catch. OpenCV looks at this
+# when it first uses FFmpeg; -8 is FFmpeg's "quiet". What a user has set stays.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 _JPEG_QUALITY = 98
 # Headers count a little wrong in sound files, too.
 _FRAMES_AMISS, _FRACTION_AMISS = 2, 0.02
+_FEWEST_LEFT = 10  # frames before a break, to choose from
 
 
 @dataclass(frozen=True)
@@ -95,17 +102,18 @@ class Video:
     def _opened(self) -> Iterator[cv2.VideoCapture]:
         if not self.path.is_file():
             raise RefractError(f"there is no video {self.path}; give a video file")
-        # What OpenCV prints of a broken file, the error says in one line.
-        level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
         capture = cv2.VideoCapture()
         try:
-            if not capture.open(str(self.path)):
-                raise RefractError(f"the video {self.path} cannot be decoded; re-encode it, as MP4 say")
+            # What decoders print of a broken file, the error says in one line.
+            with silence():
+                opened = capture.open(str(self.path))
+            if not opened:
+                raise self._undecodable()
             capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
             yield capture
         finally:
-            capture.release()
-            cv2.utils.logging.setLogLevel(level)
+            with silence():
+                capture.release()
 
     def _grabbed(self) -> Iterator[tuple[int, float, cv2.VideoCapture]]:
         """Index, time and the capture that holds it, of each frame between start and end.
@@ -115,7 +123,7 @@ class Video:
         with self._opened() as capture:
             total, fps = capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_FPS)
             index, time = 0, 0.0
-            while capture.grab():
+            while _grab(capture):
                 stamp = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
                 # Some formats carry no time.
                 time = stamp if stamp > 0 or not fps > 0 else index / fps
@@ -125,18 +133,28 @@ class Video:
                     yield index, time, capture
                 index += 1
             if index == 0:
-                raise RefractError(f"the video {self.path} cannot be decoded; re-encode it, as MP4 say")
+                raise self._undecodable()
             if index < total - max(_FRAMES_AMISS, _FRACTION_AMISS * total):
                 raise self._broken(index, total, time)
 
     def _retrieve(self, capture: cv2.VideoCapture, index: int) -> Gray:
-        decoded, image = capture.retrieve()
+        with silence():
+            decoded, image = capture.retrieve()
         if not decoded or image is None:
             raise self._broken(index, capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
         return np.asarray(image, np.uint8)
 
     def _broken(self, index: int, total: float, time: float) -> RefractError:
-        return RefractError(
-            f"the video {self.path} breaks off after {index} of {total:.0f} frames; re-encode it, or use what "
-            f"is there: --end_time {math.floor(10 * max(time - 0.1, 0)) / 10:g}"
-        )
+        what = f"the video {self.path} breaks off after {index} of {total:.0f} frames; copy or convert it again"
+        end = math.floor(10 * (time - 0.1)) / 10
+        if index >= _FEWEST_LEFT and end > self.start_time:
+            what += f", or use what is there: --end_time {end:g}"
+        return RefractError(what)
+
+    def _undecodable(self) -> RefractError:
+        return RefractError(f"the video {self.path} cannot be decoded; copy it again, or convert it, to MP4 say")
+
+
+def _grab(capture: cv2.VideoCapture) -> bool:
+    with silence():
+        return capture.grab()

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Literal
 
 from colmap_refract.errors import RefractError
+from colmap_refract.files.cameras_file import fit_to_size
 from colmap_refract.files.quiet import quiet_pycolmap
 from colmap_refract.reconstructor.inventory import by_size, only_size
 from colmap_refract.reconstructor.record import Photograph
 
 if TYPE_CHECKING:
     import pycolmap
-
-MAX_ASPECT_CHANGE = 0.005
-"""Relative; more is a crop or another sensor mode, of which the principal point is not known."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +85,7 @@ def assign_cameras(
         return Assignment(groups=groups, scheme="size" if len(groups) > 1 else "single", calibrated=False)
     if len(cameras) == 1:
         size = only_size(photographs)
-        camera, remark = fit_to_size(next(iter(cameras.values())), size)
+        camera, remark = fitted_camera(next(iter(cameras.values())), size)
         group = CameraGroup(names=list(photographs), camera=camera)
         return Assignment(groups=[group], remarks=[remark] if remark else [])
     sizes = by_size(photographs)
@@ -117,38 +114,18 @@ def assign_cameras(
         )
     groups, remarks = [], []
     for (folder, names), (camera_id, camera) in zip(sorted(folders.items()), sorted(cameras.items()), strict=True):
-        fitted, remark = fit_to_size(camera, only_size({name: photographs[name] for name in names}))
+        fitted, remark = fitted_camera(camera, only_size({name: photographs[name] for name in names}))
         groups.append(CameraGroup(names=names, camera=fitted))
         remarks.append(f"folder {folder} taken by camera {camera_id}" + (f" ({remark})" if remark else ""))
     return Assignment(groups=groups, scheme="folder", remarks=remarks)
 
 
-def fit_to_size(camera: pycolmap.Camera, size: tuple[int, int]) -> tuple[pycolmap.Camera, str]:
-    """The camera for images of a size, and what has been done to it ('' for nothing).
-
-    Focal lengths and principal point go with the width and the height; distortion parameters act on directions
-    and stay.
-
-    Raises:
-        RefractError: the images have another shape than those of the calibration.
-    """
+def fitted_camera(camera: pycolmap.Camera, size: tuple[int, int]) -> tuple[pycolmap.Camera, str]:
+    """The camera for images of a size, and what has been done to it ('' for nothing)."""
     known = (int(camera.width), int(camera.height))
-    fitted = copy.deepcopy(camera)
-    fitted.has_prior_focal_length = True
     if known == size:
-        return fitted, ""
-    turned = known[::-1]
-    if abs(size[0] * known[1] / (size[1] * known[0]) - 1) > MAX_ASPECT_CHANGE:
-        hint = (
-            "turn the images as the camera took them"
-            if abs(size[0] * turned[1] / (size[1] * turned[0]) - 1) <= MAX_ASPECT_CHANGE
-            else "calibrate with uncropped images of the same mode"
-        )
-        raise RefractError(
-            f"the images have {size[0]} x {size[1]} pixels, the calibration is for {known[0]} x {known[1]}, "
-            f"another shape; {hint}"
-        )
-    fitted.rescale(*size)
+        return fit_to_size(camera, *size), ""
+    fitted = fit_to_size(camera, *size)
     return fitted, f"calibration rescaled from {known[0]} x {known[1]} to {size[0]} x {size[1]} pixels"
 
 

@@ -12,11 +12,14 @@ import json
 import os
 import pickle
 import re
+import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import closing, suppress
 from pathlib import Path
 from queue import Empty, Queue
 from typing import Any
@@ -24,6 +27,8 @@ from typing import Any
 from colmap_refract.errors import RefractError
 
 _POLL_SECONDS = 0.25
+_NEXT_TO_NO_ROOM = 1 << 20
+"""Bytes."""
 _FULL_DISK = ("disk is full", "No space left", "disk I/O error", "File too large")
 
 
@@ -68,6 +73,7 @@ def run_colmap(
         finally:
             process.kill()
             process.wait()
+            _settle(arguments.get("database_path"))
             for pipe in (process.stdin, process.stdout):
                 if pipe is not None:
                     pipe.close()
@@ -78,9 +84,27 @@ def run_colmap(
         name = signal.Signals(number).name if number in set(signal.Signals) else f"status {process.returncode}"
         hint = "is there enough memory? fewer --num_threads need less" if name == "SIGKILL" else f"see {log_path}"
         failure = f"its process ended with {name}; {hint}"
-    if any(sign in failure + _tail(log_path) for sign in _FULL_DISK):
+    if any(sign in failure + _tail(log_path) for sign in _FULL_DISK) or _is_full(log_path.parent, arguments):
         failure = "the disk is full, or the file may not grow further; make room, and run it again"
     raise RefractError(f"COLMAP's {what} failed: {failure}")
+
+
+def _is_full(folder: Path, arguments: dict[str, Any]) -> bool:
+    """Whether a disk that was written to has next to no room left: COLMAP may abort without a word then."""
+    written = [Path(arguments[name]).parent for name in ("database_path", "output_path") if name in arguments]
+    for place in (folder, *written):
+        with suppress(OSError):
+            if shutil.disk_usage(place).free < _NEXT_TO_NO_ROOM:
+                return True
+    return False
+
+
+def _settle(path: Path | None) -> None:
+    """Bring into a database what a process that was ended has left in files beside it."""
+    if path is None or not os.path.exists(f"{path}-wal"):
+        return
+    with suppress(sqlite3.Error), closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=rw", uri=True)) as database:
+        database.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()  # it is closed as it was if never read
 
 
 def _wait(

@@ -13,7 +13,7 @@ import numpy as np
 
 from colmap_refract.errors import RefractError
 from colmap_refract.files.output import WORK_PREFIX
-from colmap_refract.mapping.database import check_database
+from colmap_refract.mapping.database import check_database, read_only
 
 if TYPE_CHECKING:
     import pycolmap
@@ -57,17 +57,10 @@ def read_contents(path: Path) -> Contents:
     """
     check_database(path)
     try:
-        with closing(_connect(path)) as database:
+        with closing(read_only(path)) as database:
             return _contents(database)
     except sqlite3.Error as error:
         raise RefractError(f"{path} cannot be read ({error}); copy it again, or move it away to begin anew") from None
-
-
-def _connect(path: Path) -> sqlite3.Connection:
-    # Not mode=ro: that leaves SQLite's auxiliary files behind.
-    connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=rw", uri=True, timeout=5)
-    connection.execute("PRAGMA query_only = 1")
-    return connection
 
 
 def _contents(database: sqlite3.Connection) -> Contents:
@@ -122,7 +115,9 @@ def camera_key(camera: pycolmap.Camera) -> list[Any]:
 def count_rows(path: Path, query: str) -> int | None:
     """Result of a query while another process writes the database; None if it cannot be had just now."""
     try:
-        with closing(_connect(path)) as database:
+        # Not mode=ro: that leaves SQLite's auxiliary files behind if the other process ends meanwhile.
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=rw", uri=True, timeout=5)) as database:
+            database.execute("PRAGMA query_only = 1")
             return int(database.execute(query).fetchone()[0])
     except sqlite3.Error:
         return None

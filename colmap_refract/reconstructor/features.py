@@ -13,13 +13,14 @@ from colmap_refract.reconstructor.colmap_options import extraction_options
 from colmap_refract.reconstructor.colmap_process import run_colmap
 from colmap_refract.reconstructor.contents import NUM_KEYPOINTS, Contents, camera_key, count_rows, read_contents
 from colmap_refract.reconstructor.options import ReconstructorOptions, given
-from colmap_refract.reconstructor.record import Photograph, Step
+from colmap_refract.reconstructor.record import Photograph, Step, in_words
 from colmap_refract.reconstructor.workspace import Workspace
 from colmap_refract.reconstructor.workspace_database import (
     FEATURES,
     MATCHES,
     Database,
     check_images,
+    check_keypoints,
     other_cameras,
     put_database,
     warn_of_intrinsics,
@@ -62,6 +63,7 @@ def extract_features(
     elif not ours:
         check_images(path, contents, photographs)
     warn_of_intrinsics(workspace, assignment, ours=ours)
+    known = contents
     cameras = other_cameras(path, contents, assignment)
     if ours and cameras:
         with open_database(path) as database:
@@ -83,6 +85,8 @@ def extract_features(
         contents = read_contents(path)
         cameras = {} if ours else other_cameras(path, contents, assignment)
     _check_features(workspace, photographs, contents)
+    if not ours:
+        check_keypoints(workspace, known)
     taken_over = not lacking
     if lacking or workspace.done(FEATURES, inputs, contents.features) is None or (step and step.facts != facts):
         record.begin(FEATURES, inputs)
@@ -103,7 +107,7 @@ def why_anew(workspace: Workspace, inputs: dict[str, Any], assignment: Assignmen
     if changes == ["cameras"] or (step.facts.get("calibrated") and not assignment.calibrated):
         return "made anew, since the cameras were dealt out anew"
     if changes:
-        return f"made anew, since {changes[0]} changed"
+        return f"made anew, since {in_words(changes[0])} changed"
     return ""
 
 

@@ -11,6 +11,7 @@ from colmap_refract.reconstructor.colmap_options import matching_options, pairin
 from colmap_refract.reconstructor.colmap_process import run_colmap
 from colmap_refract.reconstructor.contents import NUM_PAIRS, Contents, count_rows, read_contents
 from colmap_refract.reconstructor.options import ReconstructorOptions, given
+from colmap_refract.reconstructor.record import in_words
 from colmap_refract.reconstructor.workspace import Workspace
 from colmap_refract.reconstructor.workspace_database import MATCHES, Database
 
@@ -44,7 +45,7 @@ def match_features(
         taken_over = workspace.done(MATCHES, inputs, contents.matches) is not None
         changed = [name for name in changes or [] if name != "features"]
         if changed and contents.num_pairs:
-            reason = f"matched anew, since {changed[0]} changed"
+            reason = f"matched anew, since {in_words(changed[0])} changed"
             _clear(workspace, everything=options.FeatureMatching.guided_matching or _touches_matching(changed))
             contents = read_contents(workspace.database_path)
     num_before = contents.num_pairs

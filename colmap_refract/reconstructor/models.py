@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import shutil
-import sqlite3
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from colmap_refract.errors import RefractError, listed
 from colmap_refract.files.model_io import read_model, write_model
-from colmap_refract.mapping.database import open_database
+from colmap_refract.mapping.database import copy_database, open_database
 from colmap_refract.options import RefinerOptions
 from colmap_refract.reconstructor.colmap_options import mapping_options
 from colmap_refract.reconstructor.colmap_process import run_colmap
 from colmap_refract.reconstructor.contents import camera_key, fingerprint
 from colmap_refract.reconstructor.options import ReconstructorOptions, given
+from colmap_refract.reconstructor.record import in_words
 from colmap_refract.reconstructor.workspace import Workspace, replace_folder
 from colmap_refract.reconstructor.workspace_database import Database
 
@@ -87,7 +86,7 @@ def map_images(
     remark = "taken over from an earlier run"
     if not output or workspace.done(MAPPING, inputs, output) is None:
         changes = workspace.changes(MAPPING, inputs)
-        remark = f"mapped anew, since {changes[0]} changed" if output and changes else ""
+        remark = f"mapped anew, since {in_words(changes[0])} changed" if output and changes else ""
         with workspace.scratch() as scratch:
             how = _map(workspace, database, options, refiner, scratch)
             # Noted before the folder changes hands, so that neither the old nor the new one is taken for a stranger's.
@@ -213,23 +212,17 @@ def _from_pairs(
 
 
 def _with_cameras(path: Path, database: Database, scratch: Path) -> Path:
-    """A database for the mapper: the database itself, or a copy where its cameras have to be others.
+    """A database for the mapper: the database itself, or a copy where it was made elsewhere or has other cameras.
 
-    Those are calibrated cameras that a database made elsewhere must not be given, and guessed ones: they are said to
-    be known, as the mapper otherwise finds a focal length of its own when it places an image, whatever its options.
+    COLMAP alters every database that it opens. Other cameras are calibrated ones that a database made elsewhere must
+    not be given, and guessed ones: they are said to be known, as the mapper otherwise finds a focal length of its own
+    when it places an image, whatever its options.
     """
     guessed = [i for i in database.contents.camera_size if not database.contents.cameras[str(i)][3]]
-    if not database.cameras and not guessed:
+    if database.ours and not database.cameras and not guessed:
         return path
     copy = scratch / "database.db"
-    try:
-        with closing(sqlite3.connect(path)) as source, closing(sqlite3.connect(copy)) as target:
-            source.backup(target)
-            # The bulk of a database, which the mapper does not read.
-            target.execute("DELETE FROM descriptors")
-            target.commit()
-    except sqlite3.Error as error:
-        raise RefractError(f"{path} cannot be copied to {scratch.parent} ({error}); make room there") from None
+    copy_database(path, copy)
     with open_database(copy) as opened:
         for camera_id in {*guessed, *database.cameras}:
             camera = database.cameras.get(camera_id) or opened.read_camera(camera_id)

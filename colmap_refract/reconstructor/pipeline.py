@@ -22,7 +22,7 @@ from colmap_refract.reconstructor.matches import match_features
 from colmap_refract.reconstructor.models import map_images
 from colmap_refract.reconstructor.options import ReconstructorOptions, widened
 from colmap_refract.reconstructor.record import Record
-from colmap_refract.reconstructor.refined import check_refined, refine_model
+from colmap_refract.reconstructor.refined import check_refined, leave_refined, refine_model
 from colmap_refract.reconstructor.watcher import Watcher
 from colmap_refract.reconstructor.workspace import Workspace
 
@@ -108,6 +108,7 @@ def reconstruct(
             database = match_features(workspace, database, options, refiner.num_threads, refiner.random_seed)
         model = map_images(workspace, database, options, refiner)
         if not options.refine:
+            leave_refined(workspace, model)
             return Reconstructed(sparse_path=model.path, refractive_path=None, sidecar=None)
         sidecar = refine_model(
             workspace,

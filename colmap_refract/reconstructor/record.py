@@ -13,6 +13,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -73,6 +74,15 @@ class Record:
                     f"{self._path} cannot be read ({error}); what is in the workspace is taken as made elsewhere"
                 )
 
+    def exists(self) -> bool:
+        """Whether there is a file."""
+        return os.path.lexists(self._path)
+
+    def remove(self) -> None:
+        """Delete the file, if there is one."""
+        with suppress(OSError):
+            self._path.unlink()
+
     def begin(self, stage: str, inputs: dict[str, Any]) -> None:
         """Note that a stage is under way; whatever it had done before may be half replaced."""
         self.stages[stage] = Step(inputs=inputs)
@@ -131,3 +141,32 @@ def differences(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
         elif a != b:
             found.append(key)
     return found
+
+
+def in_words(difference: str) -> str:
+    """What the user knows a difference by: an option by its name on the command line."""
+    first, _, rest = difference.partition(".")
+    if first == "images":
+        return f"the image '{rest}'"
+    if first in _IN_WORDS:
+        return _IN_WORDS[first]
+    if first == "pairing":
+        return "the choice of pairs"
+    if first in ("matching", "options") and rest:
+        return in_words(rest)
+    if first == "verification" and rest:
+        return in_words(rest) if rest.partition(".")[0] in _IN_WORDS else f"--TwoViewGeometry.{rest}"
+    return f"--{difference}"
+
+
+_IN_WORDS = {
+    "cameras": "the intrinsics",
+    "detector": "--matcher",
+    "dry_images": "the list of dry images",
+    "features": "the features",
+    "fixed_camera": "--scenario",
+    "interface_groups": "the interface groups",
+    "matches": "the matches",
+    "model": "the model without refraction",
+    "random_seed": "--random_seed",
+}

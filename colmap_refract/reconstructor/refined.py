@@ -14,6 +14,7 @@ from colmap_refract.files.sidecar import SIDECAR_NAME, Sidecar, read_sidecar, wr
 from colmap_refract.options import ImageNotes, RefinerOptions
 from colmap_refract.reconstructor.contents import camera_key, fingerprint
 from colmap_refract.reconstructor.models import Model
+from colmap_refract.reconstructor.record import in_words
 from colmap_refract.reconstructor.workspace import Workspace
 from colmap_refract.reconstructor.workspace_database import Database
 
@@ -75,16 +76,32 @@ def refine_model(
         workspace.watcher.report("Refinement", "taken over from an earlier run")
         return read_sidecar(target)
     changes = workspace.changes(REFINEMENT, inputs) if output else None
-    with output_folder(target, input_path=model.path, overwrite=True) as folder:
-        result = _refine(workspace, database, model, options, complete_tracks, notes, cameras)
-        write_model(result.reconstruction, folder)
-        write_sidecar(result.sidecar, folder / SIDECAR_NAME)
-        # Noted before the folder changes hands, so that neither the old nor the new one is taken for a stranger's.
-        new = fingerprint(folder)
-        record.begin(REFINEMENT, inputs)
-        record.complete(REFINEMENT, new, {"before": output})
-    workspace.watcher.report("Refinement", f"done anew, since {changes[0]} changed" if changes else "done")
+    try:
+        with output_folder(target, input_path=model.path, overwrite=True) as folder:
+            result = _refine(workspace, database, model, options, complete_tracks, notes, cameras)
+            write_model(result.reconstruction, folder)
+            write_sidecar(result.sidecar, folder / SIDECAR_NAME)
+            # Noted before the folder changes hands, so that neither the old nor the new one is taken for a stranger's.
+            new = fingerprint(folder)
+            record.begin(REFINEMENT, inputs)
+            record.complete(REFINEMENT, new, {"before": output})
+    except (RefractError, KeyboardInterrupt):
+        if output:
+            cause = f" ({in_words(changes[0])} has changed since)" if changes else ""
+            workspace.watcher.warn(f"{target} is of an earlier run{cause}, and still there")
+        raise
+    workspace.watcher.report("Refinement", f"done anew, since {in_words(changes[0])} changed" if changes else "done")
     return result.sidecar
+
+
+def leave_refined(workspace: Workspace, model: Model) -> None:
+    """Say that there is a refined model still where none was asked for."""
+    target, step = workspace.refractive_path, workspace.record.stages.get(REFINEMENT)
+    if not fingerprint(target):
+        return
+    same = step is not None and step.inputs.get("model") == model.output
+    of = "of this model" if same else "of another model without refraction than the one that is here now"
+    workspace.watcher.warn(f"{target} is of an earlier run, {of}, and still there")
 
 
 def _refine(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -67,9 +67,15 @@ class Workspace:
     def locked(self) -> Iterator[None]:
         """The workspace for this process alone; what a killed run left half-made is removed.
 
+        Folders and a record that were made here go again if the block fails before any stage has begun.
+
         Raises:
-            RefractError: it cannot be made, or another process is at work in it.
+            RefractError: it is a file, cannot be made, or another process is at work in it.
         """
+        if self.path.exists() and not self.path.is_dir():
+            raise RefractError(f"{self.path} is a file; give a folder")
+        made = [folder for folder in (self.path, *self.path.absolute().parents) if not folder.exists()]
+        known = self.record.exists()
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             handle = os.open(self.path, os.O_RDONLY)
@@ -84,10 +90,28 @@ class Workspace:
                 _lock(handle, self.path)
             for left in self.path.glob(f"{WORK_PREFIX}*"):
                 shutil.rmtree(left, ignore_errors=True)
-            yield
+            try:
+                yield
+            except BaseException as error:
+                # What was read before an interrupt is of use to the next run.
+                if isinstance(error, Exception) and not known:
+                    self._forget()
+                for folder in made:  # only what is empty
+                    with suppress(OSError):
+                        folder.rmdir()
+                raise
         finally:
             if handle >= 0:
                 os.close(handle)
+
+    def _forget(self) -> None:
+        """Remove the record, if no stage has begun, and a log without a word."""
+        if self.record.stages or self.record.database_mark is not None:
+            return
+        self.record.remove()
+        with suppress(OSError):
+            if not self.log_path.stat().st_size:
+                self.log_path.unlink()
 
     def changes(self, stage: str, inputs: dict[str, Any]) -> list[str] | None:
         """What differs in the inputs of a stage since it was begun; None if it never was."""

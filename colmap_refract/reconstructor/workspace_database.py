@@ -12,7 +12,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from colmap_refract.errors import RefractError, reason_of
+from colmap_refract.files.quiet import quiet_pycolmap
+from colmap_refract.interface import Array
+from colmap_refract.mapping.database import read_only
+from colmap_refract.photographs.images import Gray, read_gray
 from colmap_refract.reconstructor.calibration import Assignment
 from colmap_refract.reconstructor.contents import Contents, camera_key
 from colmap_refract.reconstructor.record import Photograph
@@ -23,6 +29,18 @@ if TYPE_CHECKING:
 
 FEATURES, MATCHES = "features", "matches"
 """The stages that fill it, as the record calls them."""
+
+_LEAST_KEYPOINTS = 30
+_PART = 1024
+"""Pixels: side of the part of a picture that is looked at."""
+_BESIDE = 12
+"""Pixels: far from a keypoint, yet in surroundings like its own."""
+_NEAR, _COLMAP_SIDE = 1.5, 3200
+"""Pixels."""
+_FOUND_AGAIN = 0.15
+"""Part of the keypoints, over what is found by chance."""
+_MORE_STRUCTURE = 0.65
+"""Part of the keypoints; half by chance."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +75,66 @@ def check_images(path: Path, contents: Contents, photographs: Mapping[str, Photo
                 f"'{name}' has {photograph.width} x {photograph.height} pixels, {size[0]} x {size[1]} in {path}; give "
                 "the images it was made from, or move the database away"
             )
+
+
+def check_keypoints(workspace: Workspace, contents: Contents) -> None:
+    """Warn where the keypoints of a database made elsewhere are not those of the pictures of the same names.
+
+    Two images are looked at. Whatever found the keypoints: SIFT finds many of them again, or they lie where the
+    picture has more structure than a little beside them.
+    """
+    names = [name for name, count in contents.num_keypoints.items() if count >= _LEAST_KEYPOINTS]
+    for name in sorted({names[0], names[len(names) // 2]} if names else ()):
+        with closing(read_only(workspace.database_path)) as connection:
+            (count, columns, data) = connection.execute(
+                "SELECT rows, cols, data FROM keypoints WHERE image_id = ?", (contents.image_id[name],)
+            ).fetchone()
+        keypoints = np.frombuffer(data, dtype=np.float32).reshape(count, columns)[:, :2].astype(np.float64)
+        if not _belong(keypoints, read_gray(workspace.image_path / name)):
+            workspace.watcher.warn(
+                f"the keypoints of '{name}' do not look like those of the picture: is {workspace.database_path} the "
+                "database of these images?"
+            )
+            return
+
+
+def _belong(keypoints: Array, gray: Gray) -> bool:
+    """Whether keypoints (n, 2), COLMAP's pixels, have to do with grey values (H, W)."""
+    import pycolmap
+    from scipy.ndimage import gaussian_filter, maximum_filter
+    from scipy.spatial import cKDTree
+
+    height, width = gray.shape
+    corner = np.clip(np.median(keypoints, axis=0) - _PART / 2, 0, np.maximum([width - _PART, height - _PART], 0))
+    left, top = corner.astype(int)
+    part = np.ascontiguousarray(gray[top : top + _PART, left : left + _PART])
+    size = np.array(part.shape[::-1])
+    places = keypoints - [left, top]
+    places = places[((places > _BESIDE) & (places < size - _BESIDE)).all(axis=1)]
+    if len(places) < _LEAST_KEYPOINTS:
+        return True  # too few to tell
+    beside = [places + step for step in _BESIDE * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])]
+    with quiet_pycolmap():
+        extractor = pycolmap.FeatureExtractor.create(device=pycolmap.Device.cpu)
+        found = np.array([(point.x, point.y) for point in extractor.extract_from_uint8_array(part)[0]])
+    if len(found):
+        tree = cKDTree(found)
+        near = max(_NEAR, _NEAR * max(gray.shape) / _COLMAP_SIDE)  # COLMAP reduces larger pictures
+        again, by_chance = (float(np.mean(tree.query(where)[0] < near)) for where in (places, np.concatenate(beside)))
+        if again - by_chance > _FOUND_AGAIN:
+            return True
+    across, down = np.gradient(gaussian_filter(part.astype(np.float32), 1.0), axis=(1, 0))
+    xx, xy, yy = (gaussian_filter(product, 2.0) for product in (across * across, across * down, down * down))
+    # The smaller eigenvalue of the structure tensor.
+    structure = maximum_filter((xx + yy) / 2 - np.sqrt(((xx - yy) / 2) ** 2 + xy**2), size=3)
+
+    def at(where: Array) -> Array:
+        x, y = np.floor(where).astype(int).T  # COLMAP's pixels: the first one's centre is (0.5, 0.5)
+        return np.asarray(structure[y, x])
+
+    here = at(places)
+    more = np.mean([np.mean(here > at(where)) for where in beside])
+    return bool(more > _MORE_STRUCTURE)
 
 
 def other_cameras(path: Path, contents: Contents, assignment: Assignment) -> dict[int, pycolmap.Camera]:

@@ -22,6 +22,8 @@ _STUCK = 1e-2
 """Of the cost: with as much still to be gained, a solver that takes no more steps is stuck."""
 _NARROW_VIEW_DEG = 20.0
 _OBLIQUE_DEG = 8.0
+_WORSE, _AS_WELL = 1.02, 1 / 1.02
+"""Times the median error without refraction: noise and another loss make less of a difference."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +47,33 @@ def has_converged(adjustment: Adjustment, uncertainty: Uncertainty) -> bool:
 
 def advise(facts: Facts) -> list[str]:
     """Sentences for the user, the gravest first; none where all is well."""
-    return [*_solver(facts), *_images(facts), *_intrinsics(facts), *_planes(facts), *_index(facts), *_water(facts)]
+    return [*_solver(facts), *_images(facts), *_planes(facts), *_index(facts), *_water(facts)]
+
+
+def advise_on_input(facts: Facts) -> list[str]:
+    """Sentences about what was given: whether there is an interface at all, and whether the intrinsics are from air."""
+    return [*_straight_rays(facts), *_intrinsics(facts)]
+
+
+def _straight_rays(facts: Facts) -> list[str]:
+    """If straight rays explain the images as well as refracted ones, there may be no such interface."""
+    seen = facts.pinhole_errors[np.isfinite(facts.pinhole_errors)]
+    if not len(seen) or facts.arrangement.options.scenario == "fixed_camera":
+        return []
+    before, after = float(np.median(seen)), float(np.median(facts.errors))
+    if after > _WORSE * before:
+        return [
+            f"Straight rays explain the images better (median {before:.3g} px) than refracted ones ({after:.3g} px): "
+            "do not use the result. Either there was no interface, or the scenario, the index or the intrinsics (which "
+            "must be from air, --camera_path) are others."
+        ]
+    if facts.calibrated or after <= _AS_WELL * before:
+        return []
+    return [
+        f"Without refraction the model fits as well (median {before:.3g} px against {after:.3g} px): either nothing "
+        "is refracted here, or the intrinsics have absorbed it; give intrinsics calibrated in air (--camera_path) and "
+        "check --scenario."
+    ]
 
 
 def _solver(facts: Facts) -> list[str]:
@@ -107,14 +135,6 @@ def _intrinsics(facts: Facts) -> list[str]:
             f"The intrinsics of camera {', '.join(suspicious)} look as if COLMAP had refined them on these images. If "
             "so they have absorbed part of the refraction, and the result is wrong: give intrinsics calibrated in "
             "air (--camera_path)."
-        )
-    pinhole = facts.pinhole_errors[np.isfinite(facts.pinhole_errors)]
-    moves = facts.arrangement.options.scenario != "fixed_camera"
-    if len(pinhole) and moves and np.median(pinhole) < 1.02 * np.median(facts.errors):
-        sentences.append(
-            f"Without refraction the model fits as well (median {np.median(pinhole):.3g} px against "
-            f"{np.median(facts.errors):.3g} px): either nothing is refracted here, or the intrinsics have absorbed "
-            "it; give intrinsics calibrated in air (--camera_path) and check --scenario."
         )
     return sentences
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from time import perf_counter
@@ -14,10 +13,12 @@ import numpy as np
 from colmap_refract.errors import RefractError
 from colmap_refract.estimator.adjustment import Adjustment, SolverSettings, adjust, settle_points
 from colmap_refract.estimator.chunk import Problem
+from colmap_refract.files.cameras_file import fit_to_size
 from colmap_refract.files.model_io import copy_model
 from colmap_refract.files.sidecar import Sidecar
+from colmap_refract.machine import threads
 from colmap_refract.options import ImageNotes, RefinerOptions
-from colmap_refract.refiner.advice import Facts, advise, has_converged
+from colmap_refract.refiner.advice import Facts, advise, advise_on_input, has_converged
 from colmap_refract.refiner.arrangement import Arrangement, arrange
 from colmap_refract.refiner.averaging import average_groups
 from colmap_refract.refiner.continuation import (
@@ -36,7 +37,7 @@ from colmap_refract.refiner.filtering import label_wet, pinhole_errors, reprojec
 from colmap_refract.refiner.observations import read_observations
 from colmap_refract.refiner.outcome import make_sidecar, output_frame, statistics, write_back
 from colmap_refract.refiner.selection import Selection
-from colmap_refract.refiner.uncertainty import estimate_uncertainty
+from colmap_refract.refiner.uncertainty import Uncertainty, estimate_uncertainty
 
 if TYPE_CHECKING:
     import pycolmap
@@ -47,8 +48,16 @@ LOSS_SCALE_IN_NOISE = 4.0
 """Of the default loss: wide enough to lose nothing on Gaussian noise, narrow enough to stop a wrong match."""
 _LEAST_LOSS_SCALE = 1.0
 _NUM_FILTER_ROUNDS = 15
+_NUM_RELABEL_ROUNDS = 20
+"""Solves for points that change sides, besides those for the filter."""
 _FIRST_FILTER = 2.0
 """Times the user's limit, before the first solve of all tracks."""
+_NUM_FINISHES = 3
+_FINISHED = 5e-5
+"""Part of the cost that a Newton step would still gain: small steps along a valley look like an end."""
+_FINE = 1e-6
+_FINER = 1e-2
+"""Tolerance of each further solve over that of the last, where more than that is left."""
 _NEGLIGIBLE_CHANGE = 1e-3
 """Part of the observations whose removal or relabelling is not worth another solve."""
 
@@ -105,8 +114,9 @@ def refine(
     _check_model(model)
     observations = read_observations(model)
     before = pinhole_errors(observations)
+    remarks: list[str] = []
     if cameras:
-        _replace_cameras(model, cameras)
+        remarks = _replace_cameras(model, cameras)
         observations = read_observations(model)
     if not len(observations.points):
         raise RefractError("the model has no point that two registered images see: there is nothing to refine")
@@ -115,22 +125,20 @@ def refine(
         observations if averaged is None else averaged.observations, options, notes, refined=earlier is not None
     )
     num_unusable = model.compute_num_observations() - len(observations.image)
-    num_threads = options.num_threads if options.num_threads > 0 else _num_cores()
     settings = SolverSettings(
-        num_threads=num_threads,
+        num_threads=threads(options.num_threads),
         max_num_iterations=options.BundleAdjustment.max_num_iterations,
         function_tolerance=options.BundleAdjustment.function_tolerance,
     )
     solve_started = perf_counter()
     try:
-        selection, problem, adjustment = _solve(arrangement, settings, earlier, watch)
+        selection, problem, adjustment, uncertainty = _solve(arrangement, settings, earlier, watch)
     except FloatingPointError as error:
         raise RefractError(
             f"the adjustment could not be evaluated ({error}): check the model and the scenario"
         ) from None
     solve_seconds = perf_counter() - solve_started
     arrangement, _ = selection.active()
-    uncertainty = estimate_uncertainty(problem)
     errors = reprojection_errors(problem, arrangement.observations)
     noise = estimate_noise(problem)
     facts = Facts(
@@ -143,11 +151,14 @@ def refine(
         calibrated=bool(cameras),
         errors=errors,
     )
-    warnings = advise(facts)
+    # A model that comes from a refinement says nothing of its input any more.
+    about_input = [*remarks, *advise_on_input(facts)] if earlier is None else earlier.solver.get("input_warnings", [])
+    warnings = [*about_input, *advise(facts)]
     to_output = output_frame(arrangement, problem.state, problem.points)
     stays = arrangement.observations if averaged is None else observations.select(averaged.members(selection.keep))
     write_back(model, arrangement, problem, errors, to_output, stays)
     sidecar = make_sidecar(arrangement, notes, problem, adjustment, uncertainty, noise, to_output, warnings)
+    sidecar.solver["input_warnings"] = about_input
     seconds = (solve_seconds, perf_counter() - started)
     sidecar.statistics.update(
         statistics(reconstruction, model, before, errors, selection, num_unusable, problem, noise, seconds)
@@ -158,13 +169,6 @@ def refine(
         warnings=tuple(warnings),
         converged=has_converged(adjustment, uncertainty),
     )
-
-
-def _num_cores() -> int:
-    """Cores that this process may use, where the system tells."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _check_model(model: pycolmap.Reconstruction) -> None:
@@ -182,8 +186,9 @@ def _check_model(model: pycolmap.Reconstruction) -> None:
             raise RefractError(f"frame {frame_id} has a pose that is not finite: deregister it")
 
 
-def _replace_cameras(model: pycolmap.Reconstruction, cameras: Mapping[int, pycolmap.Camera]) -> None:
-    """In-air intrinsics in place of the model's: keypoints are raw pixels, so that is sound."""
+def _replace_cameras(model: pycolmap.Reconstruction, cameras: Mapping[int, pycolmap.Camera]) -> list[str]:
+    """In-air intrinsics in place of the model's: keypoints are raw pixels, so that is sound. What was rescaled."""
+    remarks = []
     for camera_id, camera in model.cameras.items():
         known = next(iter(cameras.values())) if len(cameras) == 1 else cameras.get(camera_id)
         if known is None:
@@ -192,34 +197,40 @@ def _replace_cameras(model: pycolmap.Reconstruction, cameras: Mapping[int, pycol
                 f"{', '.join(str(i) for i in sorted(cameras))}"
             )
         if (known.width, known.height) != (camera.width, camera.height):
-            raise RefractError(
-                f"camera {camera_id} takes images of {camera.width} x {camera.height} px, the given intrinsics are for "
-                f"{known.width} x {known.height} px: calibrate at the size of the images"
+            remarks.append(
+                f"The intrinsics given for camera {camera_id} are for {known.width} x {known.height} pixels and were "
+                f"rescaled to {camera.width} x {camera.height}: right if the images were only made smaller or larger."
             )
+        known = fit_to_size(known, camera.width, camera.height)
         camera.model = known.model
         camera.params = known.params
         camera.has_prior_focal_length = True
+    return remarks
 
 
 def _solve(
     arrangement: Arrangement, settings: SolverSettings, earlier: Sidecar | None, watch: Watch | None
-) -> tuple[Selection, Problem, Adjustment]:
+) -> tuple[Selection, Problem, Adjustment, Uncertainty]:
     """Start, solve, filter and solve again, until nothing more comes or goes."""
     options = arrangement.options
     begin = _from_scratch(arrangement, settings, watch) if earlier is None else arrangement.resume(earlier)
     noise = estimate_noise(begin)
     everything = np.ones(len(begin.tracks.image), dtype=np.bool_)
     selection, _ = Selection(arrangement=arrangement, problem=begin, keep=everything).relifted()
-    # The start comes from a few tracks, or from others: what it finds wrong by little may be right. Nor does it tell
-    # a point's side of the plane yet: only what is clearly better seen straight is dry.
+    # The start comes from a few tracks, or from others: what it finds wrong by little may be right.
     limit = _FIRST_FILTER * options.filter_max_reproj_error
-    errors = reprojection_errors(selection.problem, selection.arrangement.observations)
-    doubtful = limit == 0 or (errors > limit).mean() > _NEGLIGIBLE_CHANGE
-    wet = label_by_fit(selection.problem, doubtful=bool(doubtful))
-    selection, _ = selection.filtered(wet, settings, limit)
     narrow = view_deg(selection.problem) < NARROW_VIEW_DEG
-    for round_ in range(_NUM_FILTER_ROUNDS + 1):
-        stage = "Refractive bundle adjustment" + (f", filtered {round_ + 1} times" if round_ else "")
+    if narrow:
+        # Planes are hardly determined, and do not tell a point's side: what is clearly better seen straight is dry.
+        errors = reprojection_errors(selection.problem, selection.arrangement.observations)
+        doubtful = limit == 0 or (errors > limit).mean() > _NEGLIGIBLE_CHANGE
+        wet = label_by_fit(selection.problem, doubtful=bool(doubtful))
+    else:
+        wet = label_wet(selection.problem)
+    selection, _ = selection.filtered(wet, settings, limit)
+    num_filtered = num_relabelled = 0
+    while True:
+        stage = "Refractive bundle adjustment" + (f", filtered {num_filtered + 1} times" if num_filtered else "")
         _, problem = selection.active()
         problem = _with_loss(arrangement, problem, noise)
         adjustment = adjust(problem, settings, on_progress=named(watch, stage))
@@ -227,23 +238,38 @@ def _solve(
         selection = selection.solved(replace(problem, state=adjustment.state, points=adjustment.points))
         selection, moved = selection.relifted()
         wet = label_by_fit(selection.problem) if narrow else label_wet(selection.problem)
+        if not narrow and num_relabelled < _NUM_RELABEL_ROUNDS and selection.changes_sides(wet):
+            # Planes that were found with points on the wrong side are off, and what is right looks wrong.
+            selection = selection.relabelled(wet)
+            num_relabelled += 1
+            continue
         selection, changed = selection.filtered(wet, settings, options.filter_max_reproj_error)
-        if not moved and changed <= _NEGLIGIBLE_CHANGE:
+        if (not moved and changed <= _NEGLIGIBLE_CHANGE) or num_filtered == _NUM_FILTER_ROUNDS:
             break
+        num_filtered += 1
     _, problem = selection.active()
     if changed > 0:
         # The last few outliers say too little to solve everything again for: points alone are settled anew.
         problem = replace(problem, points=settle_points(problem, settings))
+    uncertainty = estimate_uncertainty(problem)
+    # Whoever asks for less than a fine tolerance gets that.
+    for _ in range(_NUM_FINISHES if settings.function_tolerance <= _FINE else 0):
+        if uncertainty.decrement <= _FINISHED or adjustment.termination != "convergence":
+            break
+        settings = replace(settings, function_tolerance=_FINER * settings.function_tolerance)
+        adjustment = adjust(problem, settings, on_progress=named(watch, "Last steps"))
+        problem = replace(problem, state=adjustment.state, points=adjustment.points)
+        uncertainty = estimate_uncertainty(problem)
     if not is_sound(problem):
-        _raise_unsound(problem)
-    return selection, problem, adjustment
+        _raise_unsound(problem, options)
+    return selection, problem, adjustment, uncertainty
 
 
 def _from_scratch(arrangement: Arrangement, settings: SolverSettings, watch: Watch | None) -> Problem:
     """All observations, from a start that is sought."""
     start = find_start(arrangement, settings, watch)
     if not start.sound:
-        _raise_unsound(start.problem)
+        _raise_unsound(start.problem, arrangement.options)
     return spread_out(arrangement, start, settings)
 
 
@@ -255,9 +281,17 @@ def _with_loss(arrangement: Arrangement, problem: Problem, noise: float) -> Prob
     return replace(problem, loss=adjustment.loss_function_type, loss_scale=scale)
 
 
-def _raise_unsound(problem: Problem) -> None:
+def _raise_unsound(problem: Problem, options: RefinerOptions) -> None:
     _, distance = problem.state.planes_in_cam(problem.structure)
-    if np.nanmin(distance) <= MIN_DISTANCE:
+    near = bool(np.nanmin(distance) <= MIN_DISTANCE)
+    if options.scenario == "fixed_camera":
+        # Only tilts that differ tell the water's depth: equal planes show the same whatever their distance.
+        raise RefractError(
+            f"the interface ran {'into the camera' if near else 'beyond the points, where nothing is refracted'}: its "
+            "distance cannot be told from these images; it takes larger tilts or more images, or hold a known "
+            "interface_distance (refine_interface_distance 0); else check the intrinsics (camera_path) and the scenario"
+        )
+    if near:
         raise RefractError(
             "the interface ran into the camera: the data do not show it at a distance; check the scenario, use "
             "intrinsics from air (camera_path), or hold interface_distance (refine_interface_distance 0)"

@@ -58,6 +58,7 @@ def _model(sidecar: Sidecar) -> list[str]:
         (s.get("num_completed_observations"), "observations added"),
         (s.get("num_merged_points3D"), "points merged into others"),
         (s.get("num_created_points3D"), "points created"),
+        (s.get("num_dissolved_points3D"), "points given up"),
     ]
     if any(count is not None for count, _ in gained):
         lines.append(
@@ -68,7 +69,7 @@ def _model(sidecar: Sidecar) -> list[str]:
     lines += [
         _row("Mean reprojection error", _errors(s, "mean")),
         _row("Median reprojection error", _errors(s, "median")),
-        _row("Keypoint noise (1 sigma, per axis)", f" {_number(s.get('noise'))} px"),
+        _row("Keypoint noise, 1 sigma per axis", f"{_number(s.get('noise'))} px"),
     ]
     return lines
 
@@ -89,7 +90,7 @@ def _interfaces(sidecar: Sidecar) -> list[str]:
             groups.setdefault(image.group or name, []).append(image)
     metric = sidecar.units.get("distance") == "metre"
     unit = "m" if metric else "model units"
-    head = f"{'Interface':28s}{'images':>7s}  {'distance [' + unit + ']':28s}{'tilt [deg]':20s}"
+    head = f"{'Interface':28s}{'images':>7s}  {'distance [' + unit + ']':28s}tilt [deg]"
     lines = [head, "-" * _WIDTH]
     for group, images in list(groups.items())[:_MOST_ROWS]:
         distances = np.array([image.distance for image in images])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -69,9 +69,28 @@ class Judgement:
     """The same over the points of `rmse_best90`."""
     scale: float
     """Metres per unit of the model, by the alignment."""
-    errors: Array
+    errors: Array = field(repr=False)
     """(P,) of the judged points, aligned to the best 90 %; in the order of `point3D_ids`."""
-    point3D_ids: tuple[int, ...]
+    point3D_ids: tuple[int, ...] = field(repr=False)
+
+    def __str__(self) -> str:
+        """The numbers with their units, one per line, without a final newline."""
+        one_depth = f"{_mm(self.constant_depth_rmse)} if all had one depth"
+        rows = {
+            "Judged": f"{self.num_points} points, {self.num_observations} keypoints",
+            "Left out, wrong matches": f"{self.wrong_points} points, {self.wrong_observations} keypoints",
+            "Error of the points (rms)": _mm(self.rmse),
+            "Error of the best 90 % (rms)": _mm(self.rmse_best90),
+            "Error, median": _mm(self.median_error),
+            "Off the ground, best 90 % (rms)": _mm(self.surface_rms),
+            "Off the ground, median": _mm(self.surface_median),
+            "Depth, best 90 % (rms)": f"{_mm(self.depth_rmse_best90)}; {one_depth}",
+            "Noise of the keypoints": f"{self.keypoint_noise:.3g} px per axis, {self.keypoint_rms:.3g} px (rms)",
+        }
+        if self.bound is not None and self.bound_best90 is not None:
+            rows["Allowed by that noise (rms)"] = f"{_mm(self.bound)}; {_mm(self.bound_best90)} for the best 90 %"
+        rows["A unit of the model"] = f"{self.scale:.6g} m"
+        return "\n".join(f"{label + ':':34s}{value}" for label, value in rows.items())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -267,6 +286,10 @@ def _sample_distance(truth: Truth, index: int) -> float:
     )
     steps = np.linalg.norm(points[1:] - points[0], axis=2)
     return float(np.nanmedian(steps)) if np.isfinite(steps).any() else np.nan
+
+
+def _mm(metres: float) -> str:
+    return f"{1000 * metres:.3g} mm"
 
 
 def _spread(points: Array) -> float:

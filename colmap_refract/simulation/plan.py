@@ -16,6 +16,8 @@ from colmap_refract.simulation.session import SessionOptions, ground_sample_dist
 from colmap_refract.simulation.surface import surface_at
 from colmap_refract.simulation.truth import Truth
 
+FEWEST_POINTS = 10  # that a bound is computed from
+
 
 @dataclass(frozen=True, kw_only=True)
 class Accuracy:
@@ -68,9 +70,11 @@ def plan(options: SessionOptions) -> Plan:
     Raises:
         RefractError: options that contradict each other, a camera under water, no overlap.
     """
+    if options.scene.num_points < FEWEST_POINTS:
+        raise RefractError(f"num_points {options.scene.num_points} is too few to plan with: give 100 or more")
     capture = simulate(options.scene)
     model = capture.reconstruction
-    if model.num_points3D() < 10:
+    if model.num_points3D() < FEWEST_POINTS:
         raise RefractError(
             f"{model.num_points3D()} of {options.scene.num_points} points are in two images or more: take more images, "
             "nearer to each other, or from farther away"

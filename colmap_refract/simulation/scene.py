@@ -66,15 +66,24 @@ class SceneOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.num_images < 2 or self.num_images % self.sensors_per_frame:
-            raise RefractError(f"{self.num_images} images: need two or more, a multiple of sensors_per_frame")
+        if self.num_images < 2:
+            raise RefractError(f"num_images {self.num_images} is too few images: give two or more")
+        if self.num_images % self.sensors_per_frame:
+            raise RefractError(
+                f"{self.num_images} images cannot be taken {self.sensors_per_frame} at once: give a num_images that is "
+                "a multiple of sensors_per_frame"
+            )
+        if self.seed < 0:
+            raise RefractError(f"seed {self.seed} is negative: give 0 or more")
         if self.scenario == "fixed_camera" and (self.num_cameras > 1 or self.sensors_per_frame > 1):
             raise RefractError("fixed_camera has one camera: leave num_cameras and sensors_per_frame at 1")
         if self.scenario == "camera_housing" and self.dry_point_ratio > 0:
             raise RefractError("camera_housing has no dry points: leave dry_point_ratio at 0")
         if self.camera_params and self.num_cameras * self.sensors_per_frame > 1:
             raise RefractError("camera_params are those of one camera: leave num_cameras and sensors_per_frame at 1")
-        if self.relief is not None and not 0 <= self.relief < 2 * self.water_depth:
+        if self.relief is not None and not self.relief >= 0:
+            raise RefractError(f"a relief of {self.relief:g} m is negative: give 0, a flat floor, or more")
+        if self.relief is not None and not self.relief < 2 * self.water_depth:
             raise RefractError(
                 f"a relief of {self.relief:g} m reaches out of the water: give less than twice its depth"
             )

@@ -47,8 +47,10 @@ class SessionOptions:
     def __post_init__(self) -> None:
         if not 1 <= self.jpeg_quality <= 100:
             raise RefractError(f"jpeg_quality {self.jpeg_quality} is not from 1 to 100")
-        if not np.isfinite(self.interval):
-            raise RefractError(f"interval {self.interval:g} s between the frames is not finite")
+        if not 0 <= self.interval < np.inf:
+            raise RefractError(
+                f"interval {self.interval:g} s between the images is negative or no number: give 0 or more"
+            )
         if self.waves and self.scene.scenario == "camera_housing":
             raise RefractError("camera_housing looks through a port, which has no waves: leave them out")
 
