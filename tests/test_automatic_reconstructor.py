@@ -95,13 +95,14 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(workspace: Path, pictures: Path, watcher: Watcher | None = None, **more: Any) -> Reconstructed:
-    options = {"SiftExtraction": FEATURES, **{k: v for k, v in more.items() if k != "refiner"}}
+    options = {"SiftExtraction": FEATURES, **{k: v for k, v in more.items() if k not in ("refiner", "database_path")}}
     return reconstruct(
         workspace,
         ReconstructorOptions(**options),
         more.get("refiner", REFINER),
         image_path=None if (workspace / "images").exists() else pictures / "images",
         camera_path=pictures / "cameras.txt",
+        database_path=more.get("database_path"),
         watcher=watcher,
     )
 
@@ -344,11 +345,41 @@ def test_database_made_elsewhere_gets_what_it_lacks(pictures: Path, tmp_path: Pa
     for name in before:
         assert before[name].items() <= after[name].items(), name
     assert len(after["keypoints"]) == 6 and len(after["two_view_geometries"]) == 15
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["database.db", "w"]
+    assert not any("do not look like" in line for line in watcher.lines)
     assert "6 of 6 images registered" in watcher.said("Model")
     # What is now complete is used as it is.
     calls.clear()
     go(watcher)
     assert calls == []
+
+
+def test_database_of_other_pictures_of_the_same_names(workspace: Path, pictures: Path, tmp_path: Path) -> None:
+    """Turned pictures have the same sizes and other features. That other detectors pass is shown for corners."""
+    other = tmp_path / "other"
+    for number, turned in enumerate((False, True)):
+        shutil.rmtree(other, ignore_errors=True)
+        shutil.copytree(pictures / "images", other / "images")
+        shutil.copy(pictures / "cameras.txt", other)
+        for path in (other / "images").iterdir():
+            picture = cv2.imread(str(path))
+            cv2.imwrite(str(path), picture[::-1, ::-1] if turned else picture)
+        for corners in (False, True):
+            database_path = shutil.copy(workspace / "database.db", other / "foreign.db")
+            if corners:
+                with pycolmap.Database.open(database_path) as database:
+                    for image in database.read_all_images():
+                        gray = cv2.imread(str(pictures / "images" / image.name), cv2.IMREAD_GRAYSCALE)
+                        count = database.num_keypoints_for_image(image.image_id)
+                        found = cv2.goodFeaturesToTrack(gray, count, 1e-4, 1).reshape(-1, 2) + 0.5
+                        keypoints = np.resize(found, (count, 2)).astype(np.float32)
+                        database.update_keypoints(image.image_id, keypoints)
+            watcher = Told("Mapping")
+            with pytest.raises(KeyboardInterrupt):
+                run(other / "w", other, watcher, refine=False, database_path=Path(database_path))
+            warned = [line for line in watcher.lines if "'view0.png' do not look like those of the picture" in line]
+            assert len(warned) == number, corners
+            shutil.rmtree(other / "w")
 
 
 # --- How it stops --------------------------------------------------------------------------------------------------

@@ -302,10 +302,10 @@ def test_what_one_picture_of_many_shows_is_no_advice(images: Path, tmp_path: Pat
 
 
 def test_a_few_squares_are_no_board() -> None:
-    """Three by three corners are found among pebbles; four by three are a board, if others show them as well."""
+    """Four by three corners are found among pebbles; five by four are a board, if others show them as well."""
     board = Board(kind="chessboard", num_columns=COLUMNS, num_rows=ROWS)
     down, across = np.mgrid[:400, :500] / 50 - 1.5
-    for columns, rows, size in ((4, 4, None), (5, 4, (5, 4))):
+    for columns, rows, size in ((4, 4, None), (5, 4, None), (6, 5, (6, 5))):
         picture = np.asarray(chessboard(across, down, columns, rows), np.uint8)
         likeness = describe_board(cv2.GaussianBlur(picture, (0, 0), 0.9), board)
         assert (likeness and likeness.size) == size

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import shutil
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -171,7 +172,7 @@ def other_tables(path: Path) -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda path: None, "no database file"),
+        (lambda path: None, "does not exist"),
         (lambda path: path.mkdir(), "no database file"),
         (lambda path: path.write_text("nothing of the kind" * 100), "cannot be read as a database"),
         (other_tables, "no table cameras, keypoints, matches"),
@@ -188,11 +189,32 @@ def test_what_is_wrong_with_a_database_is_said(tmp_path: Path, make: Any, messag
     assert "\n" not in str(caught.value)
 
 
-def test_looking_at_a_database_does_not_alter_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("mode", ["wal", "delete"])
+def test_looking_at_a_database_does_not_alter_it(tmp_path: Path, mode: str) -> None:
     path = make_database(tmp_path / "database.db")
+    with closing(sqlite3.connect(path)) as connection:
+        assert connection.execute(f"PRAGMA journal_mode = {mode}").fetchone() == (mode,)
     before = path.read_bytes()
+    assert before[18] == {"wal": 2, "delete": 1}[mode]  # as SQLite's header says
     check_database(path)
+    read_unposed_model(path, read_correspondences(path))
     assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_another_process_has_just_written_is_read(tmp_path: Path) -> None:
+    """It is in the write-ahead log only, and stays there."""
+    path = make_database(tmp_path / "database.db")
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("PRAGMA journal_mode = wal")
+        connection.execute("UPDATE images SET name = 'new.jpg' WHERE name = 'a.jpg'")
+        connection.commit()
+        shutil.copytree(tmp_path, tmp_path / "copy", ignore=shutil.ignore_patterns("copy", "*-shm"))
+    path = tmp_path / "copy" / "database.db"
+    before = path.read_bytes(), Path(f"{path}-wal").read_bytes()
+    assert before[1] and b"new.jpg" not in before[0]
+    assert "new.jpg" in read_correspondences(path).image_names
+    assert (path.read_bytes(), Path(f"{path}-wal").read_bytes()) == before
 
 
 def correspondences(num_keypoints: list[int], matches: dict[tuple[int, int], list[tuple[int, int]]]) -> Correspondences:

@@ -5,6 +5,7 @@ The accuracy of the tracks is shown in test_flow.py.
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import subprocess
 import sys
@@ -24,6 +25,7 @@ from colmap_refract.mapping.flow_database import create_flow_database
 from colmap_refract.mapping.tracks import build_tracks
 from colmap_refract.optical_flow.frame import FrameFlow
 from colmap_refract.optical_flow.options import FlowOptions
+from colmap_refract.optical_flow.report import lost_warning
 from colmap_refract.optical_flow.tracking import FlowTracks
 
 WIDTH, HEIGHT = 240, 180
@@ -133,6 +135,16 @@ def test_defaults_choose_a_reference_and_warn_of_the_camera(
         (camera,) = database.read_all_cameras()
         assert not camera.has_prior_focal_length
         assert camera.focal_length == pytest.approx(1.2 * WIDTH)
+
+
+def test_frames_that_show_something_else_are_warned_of() -> None:
+    lost = FrameFlow(num_points=9, num_tracks=0, length=np.nan, error=np.nan, correlation=np.nan)
+    for num_lost, warns in [(0, False), (1, False), (2, True)]:
+        tracks = some_tracks()
+        frames = {**tracks.frames, **{f"{k}.png": lost for k in range(num_lost)}}
+        warning = lost_warning(dataclasses.replace(tracks, frames=frames))
+        assert bool(warning) == warns
+        assert not warns or f"{num_lost} of {num_lost + 1}" in warning
 
 
 def command(database_path: Path, image_path: Path, **more: object) -> FlowMatcher:

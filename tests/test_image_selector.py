@@ -295,8 +295,23 @@ def test_useless_reference_is_taken_with_a_warning(moving: Sequence) -> None:
 
 
 def test_few_images_over_a_long_way_are_warned_of(moving: Sequence) -> None:
-    assert any("overlap" in w for w in select(moving, scenario="static_interface", num_images=3).warnings)
+    few = select(moving, scenario="static_interface", num_images=3)
+    assert any("overlap" in w and "would do (num_images)" in w for w in few.warnings)
     assert not any("overlap" in w for w in select(moving, scenario="static_interface", num_images=9).warnings)
+    # Frames in between are needed, if not for the number that was asked for.
+    verdicts = {frame.verdict for frame in few.frames}
+    assert "not needed" in verdicts and "Left out, not needed" in report(few)
+
+
+def test_no_more_images_are_advised_than_there_are(tmp_path: Path, moving: Sequence) -> None:
+    sparse = [k for k in moving.good if k % 8 == 0]
+    write(tmp_path, [moving.frames[k] for k in sparse])
+    for count, words in ((2, f"take all {len(sparse)} "), (len(sparse), "photograph more in between")):
+        selection = select_frames(
+            ImageFolder(tmp_path), SelectionOptions(scenario="static_interface", num_images=count)
+        )
+        (warning,) = (warning for warning in selection.warnings if "overlap" in warning)
+        assert words in warning and "would do (num_images)" not in warning
 
 
 def test_a_cut_is_warned_of(tmp_path: Path, moving: Sequence) -> None:
@@ -407,7 +422,7 @@ def test_files(tmp_path: Path, few: Path, capsys: pytest.CaptureFixture[str]) ->
     assert written == {f"images/{name}": before[name] for name in names}
     text = capsys.readouterr().out
     assert "Traceback" not in text
-    for words in [*names, "Reference:", "px of flow", "few features", "blurred", "too similar"]:
+    for words in [*names, "Reference:", "px of flow", "few features", "blurred", "not needed"]:
         assert words in text
 
 

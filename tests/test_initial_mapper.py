@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import pycolmap
 import pytest
 from conftest import Scene, Scenes
 
+from colmap_refract.cli import main
 from colmap_refract.commands.initial_mapper import InitialMapper
 from colmap_refract.commands.refiner import Refiner
 from colmap_refract.errors import RefractError
@@ -61,9 +63,9 @@ def test_fixed_camera_says_what_its_depths_are_worth(
     scenes: Scenes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command(tmp_path, scenes("fixed_camera", tilt_deg=8.0).capture).run()
-    share = re.search(r"Depths: +one, and a relief of which (\d+) % is no noise", capsys.readouterr().out)
+    share = re.search(r"Depths: +a relief about one depth, reliability (\d\.\d\d) ", capsys.readouterr().out)
     assert share is not None
-    assert 50 <= int(share[1]) <= 100
+    assert 0.5 <= float(share[1]) <= 1
 
 
 def test_calibrated_cameras_are_used(scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -100,16 +102,27 @@ def test_model_is_replaced_only_when_told_to(scene: Scene, tmp_path: Path) -> No
 
 def test_nothing_is_written_when_something_is_wrong(scene: Scene, tmp_path: Path) -> None:
     mapper = command(tmp_path, scene.capture)
-    before = mapper.database_path.read_bytes()[100:]  # behind SQLite's header, which counts who opened it
+    before = mapper.database_path.read_bytes()
     for change, message in [
         ({"reference_image": "other.jpg"}, "no image named 'other.jpg'"),
         ({"camera_path": tmp_path / "nowhere.bin"}, "does not exist"),
-        ({"database_path": tmp_path / "nowhere.db"}, "no database file"),
+        ({"database_path": tmp_path / "nowhere.db"}, "does not exist"),
+        ({"random_seed": -1}, "random_seed -1"),
     ]:
         with pytest.raises(RefractError, match=message):
             replace(mapper, **change).run()
         assert sorted(path.name for path in tmp_path.iterdir()) == ["database.db"]
-    assert mapper.database_path.read_bytes()[100:] == before
+    assert mapper.database_path.read_bytes() == before
+
+
+def test_next_command_can_be_pasted(scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "my dive"
+    folder.mkdir()
+    command(folder, scene.capture, output_path=folder / "start").run()
+    program, *words = shlex.split(capsys.readouterr().out.splitlines()[-1])
+    assert program == "colmap-refract" and str(folder / "start") in words and str(folder / "database.db") in words
+    main([*words, "--num_threads", "1", "--BundleAdjustment.max_num_iterations", "3"])
+    assert read_model(folder / "start_refined").num_reg_images() == 12
 
 
 def test_interrupt_leaves_nothing(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

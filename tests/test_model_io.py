@@ -143,6 +143,15 @@ def test_hints_at_a_model_inside(tmp_path: Path, binary: Path, inside: str) -> N
     assert message.endswith(f"did you mean {tmp_path / 'project' / inside}?")
 
 
+def test_hints_at_a_refined_model_first(tmp_path: Path, binary: Path) -> None:
+    for inside in ("sparse", "sparse_refractive"):
+        shutil.copytree(binary, tmp_path / inside / "0")
+    (tmp_path / "sparse_refractive" / "0" / "refraction.json").write_text("{}")
+    message = error_of(lambda: read_model(tmp_path))
+    refined, plain = (tmp_path / inside / "0" for inside in ("sparse_refractive", "sparse"))
+    assert message.endswith(f"did you mean {refined} (refined) or {plain}?")
+
+
 @pytest.mark.parametrize("name", ["rigs", "frames"])
 def test_rigs_without_frames(model: Path, name: str) -> None:
     (model / f"{name}.bin").unlink()

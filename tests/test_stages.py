@@ -6,6 +6,7 @@ of real pictures do is not shown.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -31,7 +32,7 @@ from colmap_refract.reconstructor.colmap_process import run_colmap
 from colmap_refract.reconstructor.contents import fingerprint, read_contents
 from colmap_refract.reconstructor.options import MapperOptions, ReconstructorOptions, TwoViewGeometryOptions
 from colmap_refract.reconstructor.pipeline import Reconstructed, reconstruct
-from colmap_refract.reconstructor.record import RECORD_NAME, Photograph, Record, differences
+from colmap_refract.reconstructor.record import RECORD_NAME, Photograph, Record, differences, in_words
 from colmap_refract.reconstructor.watcher import Watcher
 from colmap_refract.reconstructor.workspace import Workspace, replace_folder
 from colmap_refract.reconstructor.workspace_database import put_database
@@ -198,6 +199,25 @@ def test_record_survives_a_disk_that_takes_no_more(tmp_path: Path, monkeypatch: 
     with pytest.raises(RefractError, match="disk is full"):
         record.begin("matches", {})
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {RECORD_NAME: before}
+
+
+@pytest.mark.parametrize(
+    ("difference", "words"),
+    [
+        ("images.a/b.c.png", "the image 'a/b.c.png'"),
+        ("SiftExtraction.peak_threshold", "--SiftExtraction.peak_threshold"),
+        ("matching.matcher", "--matcher"),
+        ("matching.SiftMatching.max_ratio", "--SiftMatching.max_ratio"),
+        ("matching.pairing.overlap", "the choice of pairs"),
+        ("verification.max_error", "--TwoViewGeometry.max_error"),
+        ("verification.random_seed", "--random_seed"),
+        ("verification.cameras.1", "the intrinsics"),
+        ("options.BundleAdjustment.max_num_iterations", "--BundleAdjustment.max_num_iterations"),
+        ("interface_groups.f00_0.png", "the interface groups"),
+    ],
+)
+def test_differences_are_said_as_the_user_knows_them(difference: str, words: str) -> None:
+    assert in_words(difference) == words
 
 
 def test_differences_are_named() -> None:
@@ -409,6 +429,17 @@ def test_killed_process_is_one_line(import_again: dict[str, Any], tmp_path: Path
         run_colmap("add_images", import_again, log_path=tmp_path / "log.txt", what="import", poll=kill)
 
 
+def test_disk_without_room_is_named_whatever_colmap_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A made-up answer of the system; a full disk is not tried."""
+    arguments = {"database_path": tmp_path / "none.db", "image_path": tmp_path, "output_path": tmp_path / "out"}
+    usage = shutil.disk_usage(tmp_path)
+    for free, full in [(1 << 30, False), (4096, True)]:
+        monkeypatch.setattr(shutil, "disk_usage", lambda _, free=free: usage._replace(free=free))
+        with pytest.raises(RefractError) as caught:
+            run_colmap("map", {**arguments, "options": None}, log_path=tmp_path / "log.txt", what="mapping")
+        assert ("the disk is full" in str(caught.value)) == full
+
+
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="children are listed by Linux")
 def test_process_does_not_outlive_an_interrupt(import_again: dict[str, Any], tmp_path: Path) -> None:
     before = process_ids()
@@ -451,8 +482,33 @@ def test_one_at_a_time_and_what_a_killed_run_left_is_removed(tmp_path: Path) -> 
 
 def test_workspace_that_is_a_file(tmp_path: Path) -> None:
     (tmp_path / "w").write_text("")
-    with pytest.raises(RefractError, match="cannot write"), make_workspace(tmp_path / "w").locked():
+    with pytest.raises(RefractError, match="w is a file; give a folder"), make_workspace(tmp_path / "w").locked():
         pass
+
+
+def test_what_fails_before_anything_is_done_leaves_nothing(tmp_path: Path) -> None:
+    def fail(path: Path, error: BaseException, *, begin: bool = False) -> None:
+        workspace = make_workspace(path)
+        with pytest.raises(type(error)), workspace.locked():
+            workspace.record.photographs = {"a": Photograph(bytes=1, mtime_ns=2, width=3, height=4, sha256="5")}
+            workspace.record.write()
+            workspace.log_path.touch()
+            if begin:
+                workspace.record.begin("features", {})
+            raise error
+
+    fail(tmp_path / "new" / "w", RefractError(""))
+    assert not list(tmp_path.iterdir())
+    mine = tmp_path / "w" / "images" / "a.png"
+    write_blank(mine)
+    fail(tmp_path / "w", RefractError(""))
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [mine]
+    fail(tmp_path / "begun", RefractError(""), begin=True)
+    fail(tmp_path / "interrupted", KeyboardInterrupt())
+    for name in ("begun", "interrupted"):
+        assert (tmp_path / name / RECORD_NAME).exists()
+        fail(tmp_path / name, RefractError(""))  # of an earlier run
+        assert (tmp_path / name / RECORD_NAME).exists()
 
 
 def test_folder_is_replaced_or_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -515,14 +571,21 @@ def test_contents_are_counted_and_change_with_what_they_stand_for(workspace: Pat
     assert fewer.features == moved.features and fewer.matches != moved.matches
 
 
+@pytest.mark.parametrize(("mode", "calibrated"), [("delete", True), ("wal", False)])
 def test_database_made_elsewhere_is_used_and_not_altered(
-    workspace: Path, calls: list[str], camera_path: Path, capture: Capture
+    workspace: Path, calls: list[str], camera_path: Path, capture: Capture, mode: str, calibrated: bool
 ) -> None:
-    before = tables(workspace / "database.db")
+    with closing(sqlite3.connect(workspace / "database.db")) as database:
+        assert database.execute(f"PRAGMA journal_mode = {mode}").fetchone() == (mode,)
+    before = (workspace / "database.db").read_bytes()
     watcher = Told()
-    result = run(workspace, watcher, camera_path=camera_path)
+    with contextlib.chdir(workspace.parent):  # as most users call it: with a relative path
+        run(Path(workspace.name), Told(), camera_path=camera_path if calibrated else None, refine=False)
+    shutil.rmtree(workspace / "sparse")
+    calls.clear()
+    result = run(workspace, watcher, camera_path=camera_path if calibrated else None)
     assert calls == ["map"]
-    assert tables(workspace / "database.db") == before
+    assert (workspace / "database.db").read_bytes() == before
     assert "made elsewhere, used as it is" in watcher.said("Features")
     assert "made elsewhere, used as they are" in watcher.said("Matches")
     assert "6 of 6 images registered" in watcher.said("Model")
@@ -545,7 +608,12 @@ def test_database_made_elsewhere_is_used_and_not_altered(
     # Again, with other options of matching: still as it is; and nothing is done twice.
     left, watcher = files(workspace), Told()
     calls.clear()
-    run(workspace, watcher, camera_path=camera_path, TwoViewGeometry=TwoViewGeometryOptions(max_error=2.0))
+    run(
+        workspace,
+        watcher,
+        camera_path=camera_path if calibrated else None,
+        TwoViewGeometry=TwoViewGeometryOptions(max_error=2.0),
+    )
     assert calls == [] and "taken over" in watcher.said("Refinement")
     assert {k: v for k, v in files(workspace).items() if k != RECORD_NAME} == {
         k: v for k, v in left.items() if k != RECORD_NAME
@@ -667,7 +735,7 @@ def test_other_options_of_the_mapper_map_anew(workspace: Path, calls: list[str])
     run(workspace, watcher, refine=False, Mapper=MapperOptions(filter_max_reproj_error=0.5))
     assert calls == ["map", "map"]
     assert files(workspace / "sparse") != first
-    assert "mapped anew, since Mapper.filter_max_reproj_error changed" in watcher.said("Model")
+    assert "mapped anew, since --Mapper.filter_max_reproj_error changed" in watcher.said("Model")
     # A model that somebody has worked on since is somebody else's.
     (workspace / "sparse" / "0" / "notes.txt").write_text("mine")
     run(workspace, watcher, refine=False)
@@ -749,8 +817,27 @@ def test_refined_model_is_ours_to_replace_and_no_other(workspace: Path, calls: l
     refiner = RefinerOptions(scenario="static_interface", num_threads=1, refractive_index=1.34)
     reconstruct(workspace, ReconstructorOptions(complete_tracks=False), refiner, watcher=watcher)
     assert calls == ["map"]
-    assert "done anew, since options.refractive_index changed" in watcher.said("Refinement")
+    assert "done anew, since --refractive_index changed" in watcher.said("Refinement")
     assert set(files(target)) == set(first) and files(target) != first
+
+
+def test_refined_model_of_an_earlier_run_is_named(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    target = workspace / "sparse_refractive" / "0"
+    run(workspace, complete_tracks=False)
+    before, watcher = files(target), Told()
+    run(workspace, watcher, refine=False)
+    assert f"{target} is of an earlier run, of this model, and still there" in watcher.said("WARNING: /")
+
+    def fail(*_: object) -> None:
+        raise RefractError("no point is left")
+
+    monkeypatch.setattr("colmap_refract.reconstructor.refined._refine", fail)
+    watcher = Told()
+    refiner = RefinerOptions(scenario="static_interface", num_threads=1, refractive_index=1.34)
+    with pytest.raises(RefractError, match="no point is left"):
+        reconstruct(workspace, ReconstructorOptions(complete_tracks=False), refiner, watcher=watcher)
+    assert "of an earlier run (--refractive_index has changed since), and still there" in watcher.said("WARNING: /")
+    assert files(target) == before
 
 
 def test_interrupts_leave_what_was_done(workspace: Path, calls: list[str]) -> None:
@@ -794,17 +881,20 @@ def test_flow_is_tracked_once(
     (workspace / "database.db").unlink()
     tracked: list[str] = []
 
-    def track(workspace: Workspace, photographs: Any, assignment: Any, options: Any, reference: str) -> None:
+    def track(workspace: Workspace, photographs: Any, assignment: Any, options: Any, reference: str) -> str:
         tracked.append(reference)
         with workspace.scratch() as scratch:
             write_database(scratch / "database.db", capture)
             put_database(workspace, scratch / "database.db")
+        return "frame_0002.jpg"
 
     monkeypatch.setattr(flow, "_track", track)
     for _ in range(2):
-        run(workspace, scenario="fixed_camera", matcher="flow", refine=False)
+        watcher = Told()
+        run(workspace, watcher, scenario="fixed_camera", matcher="flow", refine=False)
+        assert "the reference, frame_0002.jpg" in watcher.said("Matches")
     assert tracked == [""] and calls == []
     write_blank(workspace / "images" / "frame_0003.jpg", value=90)
     watcher = Told()
     run(workspace, watcher, scenario="fixed_camera", matcher="flow", refine=False)
-    assert tracked == ["", ""] and "images.frame_0003.jpg changed" in watcher.said("Matches")
+    assert tracked == ["", ""] and "the image 'frame_0003.jpg' changed" in watcher.said("Matches")

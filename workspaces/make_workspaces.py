@@ -59,8 +59,12 @@ The scene is a floor about {depth:.2f} m below the camera, the interface {distan
 README = """\
 # Workspaces
 
-One small simulated capture per scenario, to try the commands on. `python workspaces/make_workspaces.py` writes them
-again.
+Small simulated captures to try the commands on, of two kinds: COLMAP models to refine, and pictures to reconstruct
+from.
+
+## Models
+
+One per scenario, for `refiner`. `python workspaces/make_workspaces.py` writes them again.
 
 | workspace | images | points | RMSE with refraction ignored |
 |---|---|---|---|
@@ -69,13 +73,23 @@ again.
 Each holds
 
 - `sparse/0/`: a COLMAP 4 model (`cameras`, `images`, `points3D`, `rigs`, `frames`) made with refraction ignored. There
-  are no image files.
+  are no image files: nothing was photographed.
 - `truth.npz`: the truth, lengths in metres. `point3D_ids` (n,) and `points` (n, 3); `names` (m,) of the images with
   `cam_from_world` (m, 3, 4) and `planes` (m, 4): the unit normal in the camera's frame, towards the water, and the
   distance from the projection centre along it; `mu`, the refractive index; `scenario`.
 
 The scale and frame of a model without a known distance are arbitrary, so align it to the truth by a similarity before
 comparing; `colmap_refract.simulation.point_rmse` does the like for a simulated capture.
+
+## Pictures
+
+One per scenario, rendered by exact ray tracing, for `automatic_reconstructor` and the commands that it is made of.
+`python workspaces/make_rendered.py` writes them again.
+
+{rendered}
+
+Each holds `images/`, `calibration/cameras.txt` and the truth, as its README says, with how to judge what was
+reconstructed from it.
 """
 
 
@@ -130,7 +144,8 @@ def main() -> None:
     parser.add_argument("--output_path", type=Path, default=Path(__file__).parent, help="where the folders go")
     output_path: Path = parser.parse_args().output_path
     rows = [write_workspace(output_path / name, text, options) for name, (text, options) in SCENES.items()]
-    (output_path / "README.md").write_text(README.format(rows="\n".join(rows)))
+    rendered = [f"- [`rendered_{name}`](rendered_{name}/README.md)" for name in SCENES]
+    (output_path / "README.md").write_text(README.format(rows="\n".join(rows), rendered="\n".join(rendered)))
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ DICTIONARIES = sorted({name.upper() for name in dir(cv2.aruco) if name.startswit
 
 _FIND_SIZE = 1600  # px, the longer side at which a chessboard is sought first
 _FEWEST_MARKERS = 4  # that are no accident
-_FEWEST_CORNERS = 12  # of a chessboard of unknown size; 3 x 3 are found wherever there is texture
+_FEWEST_CORNERS = 20  # of a chessboard of unknown size; 3 x 3 and 4 x 3 are found wherever there is texture
 _USUAL_MARKER = 0.75  # of a square; it only sets the window in which a corner is located
 
 
@@ -146,7 +146,7 @@ class Likeness:
 def describe_board(gray: Gray, board: Board) -> Likeness | None:
     """The board that a picture shows in place of the one that was sought.
 
-    A single picture proves little: three by three dark and light spots are soon found among pebbles, and of a board
+    A single picture proves little: a few rows of dark and light spots are soon found among pebbles, and of a board
     that reaches out of the picture only a part is seen.
 
     Args:

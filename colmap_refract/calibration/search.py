@@ -13,6 +13,8 @@ from colmap_refract.errors import RefractError
 from colmap_refract.photographs.images import check_images, common_size, list_images, read_gray
 
 _LOOKED_AT = 5  # images, for another board than the one that was sought
+_WITHOUT_ANY = 2  # that show no board at all, after which the search is given up: it takes seconds for each
+_MOST = 0.6  # of those, that have to agree on a smaller board
 _FEW = 0.5  # of the images; where the board is in fewer, another may have been meant
 
 
@@ -65,22 +67,28 @@ def _other_board(folder: Path, without: list[str], board: Board, found: int) -> 
         found: number of images in which it was found.
     """
     places = np.unique(np.linspace(0, len(without) - 1, _LOOKED_AT).astype(int))
-    seen = [describe_board(read_gray(folder / without[place]), board) for place in places]
-    shown = Counter(likeness for likeness in seen if likeness is not None)
+    shown: Counter[Likeness] = Counter()
+    for looked_at, place in enumerate(places):
+        if looked_at == _WITHOUT_ANY and not shown:
+            return None
+        likeness = describe_board(read_gray(folder / without[place]), board)
+        if likeness is not None:
+            shown[likeness] += 1
     if not shown:
         return None
     other, count = shown.most_common(1)[0]
     # One picture says something only where there is no other.
     if count < min(2, len(places)) or (len(places) == 1 and other.size is None):
         return None
-    if found == 0:
-        return other
-    # A chessboard that was found as a whole is no larger one; of those that reach out of the image a part is seen.
+    # Of boards that reach out of the image a part is seen, a different one in most pictures.
     part = (
         other.kind == board.kind == "chessboard"
         and other.size is not None
         and all(np.sort(other.size) <= np.sort([board.num_columns, board.num_rows]))
     )
+    if found == 0:
+        return None if part and count <= _MOST * len(places) else other
+    # A chessboard that was found as a whole is no smaller one.
     return None if part or count / len(places) * len(without) <= found else other
 
 

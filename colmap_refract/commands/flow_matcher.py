@@ -58,7 +58,7 @@ class FlowMatcher:
             create_flow_database(self.database_path, self.image_path, names, camera, tracks)
         if camera is None:
             logger.warning("the intrinsics are COLMAP's guess; calibrate the camera in air and give camera_path")
-        print(flow_report(tracks))
         if warning := lost_warning(tracks):
-            print(f"\nWARNING: {warning}")
+            logger.warning(warning)
+        print(flow_report(tracks))
         print(f"\nWritten to {self.database_path}")

@@ -102,7 +102,8 @@ def _fixed_camera(
             verdict, reason = "lost track", f"{100 * flow.tracked:.0f} % of the reference's points found"
         else:
             difference = float(scale * choice.nearest[k])
-            verdict, reason = "too similar", f"{difference:.1f} px of flow from a chosen one"
+            spare = choice.nearest[k] >= fixed_camera.SIMILAR * looked.side and len(choice.chosen) == options.num_images
+            verdict, reason = _not_chosen(difference, spare=bool(spare))
         records[place] = replace(
             records[place],
             verdict=verdict,
@@ -150,7 +151,8 @@ def _moving_camera(
             verdict, reason = "lost track", "no flow from the frames around it, which have one to each other"
         else:
             difference = float(np.nanmin(np.abs(positions[chosen] - positions[k])))
-            verdict, reason = "too similar", f"{difference:.1f} px of flow from a chosen one"
+            spare = difference >= scale * moving_camera.MIN_STEP * looked.side and len(chosen) == options.num_images
+            verdict, reason = _not_chosen(difference, spare=spare)
         records[place] = replace(
             records[place],
             verdict=verdict,
@@ -159,6 +161,11 @@ def _moving_camera(
             flow_length=None if np.isnan(positions[k]) else float(positions[k]),
         )
     return records, [*warnings, *_path_warnings(looked, path, chosen)]
+
+
+def _not_chosen(difference: float, *, spare: bool) -> tuple[Verdict, str]:
+    """Verdict and reason of a frame that could have been chosen; `spare` if it is a view of its own."""
+    return "not needed" if spare else "too similar", f"{difference:.1f} px of flow from a chosen one"
 
 
 def _path_warnings(looked: Looked, path: moving_camera.FlowPath, chosen: list[int]) -> list[str]:
@@ -175,6 +182,14 @@ def _path_warnings(looked: Looked, path: moving_camera.FlowPath, chosen: list[in
         enough = math.ceil(path.length / (moving_camera.MAX_STEP / 2 * side)) + 1
         warnings.append(
             f"neighbours are up to {looked.scale * most:.0f} px apart, {100 * most / side:.0f} % of the picture, and "
-            f"may overlap too little to be matched; about {enough} images would do (num_images)"
+            f"may overlap too little to be matched; {_enough(enough, len(names), len(chosen))}"
         )
     return warnings
+
+
+def _enough(enough: int, usable: int, chosen: int) -> str:
+    """How to have as many images as would do."""
+    if enough <= usable:
+        return f"about {enough} images would do (num_images)"
+    take = f"take all {usable} that can be used (num_images {usable}), and" if chosen < usable else "if you can,"
+    return f"{take} photograph more in between: about {enough} images would do"

@@ -26,7 +26,8 @@ from colmap_refract.photographs.images import Gray
 
 MIN_TRACKED = 0.4
 """Of the reference's points; a frame in which fewer are found has lost the track."""
-_SIMILAR = 5e-4  # of the longest side: flows that differ by less are the same within their error
+SIMILAR = 5e-4
+"""Of the longest side; flows that differ by less are the same within their error."""
 _REFERENCE_GRADE = 0.8  # of the median: the reference is not to be among the worse frames
 _THUMBNAIL = (80, 60)
 
@@ -98,7 +99,7 @@ def choose(
 
     chosen, gains = [reference], [0.0]
     nearest = np.linalg.norm(fields - fields[reference], axis=1)
-    similar = _SIMILAR * max(smalls[0].shape)
+    similar = SIMILAR * max(smalls[0].shape)
     while len(chosen) < num_images:
         worth = np.where(nearest >= similar, weights * nearest, 0.0)
         best = int(worth.argmax())

@@ -14,7 +14,7 @@ VERSION = 1
 
 _WIDTH = 78
 _MOST_NAMES = 3
-_LEFT_OUT = ("blurred", "few features", "lost track", "too similar")
+_LEFT_OUT = ("blurred", "few features", "lost track", "too similar", "not needed")
 
 
 def report(selection: Selection) -> str:
@@ -111,7 +111,7 @@ def _lengths(frames: list[FrameRecord]) -> str:
 
 
 def _examples(frames: list[FrameRecord]) -> str:
-    if frames[0].verdict == "too similar":
+    if frames[0].verdict in ("too similar", "not needed"):
         most = max(frame.difference or 0.0 for frame in frames)
         return f"{len(frames)}, at most {most:.1f} px of flow from a chosen one"
     first, *others = [frame.name for frame in frames[:_MOST_NAMES]]

@@ -7,7 +7,7 @@ from typing import Literal
 
 from colmap_refract.frame_selection.options import SelectionOptions
 
-Verdict = Literal["reference", "chosen", "blurred", "few features", "lost track", "too similar"]
+Verdict = Literal["reference", "chosen", "blurred", "few features", "lost track", "too similar", "not needed"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +29,7 @@ class FrameRecord:
     flow_length: float | None = None
     """Median length of the flow: from the reference (fixed camera); along all frames since the first (moving)."""
     difference: float | None = None
-    """Of the flow from that of the nearest chosen frame; of frames that are too similar."""
+    """Of the flow from that of the nearest chosen frame; of frames that are too similar, or not needed."""
     flow: tuple[float, float] | None = None
     """Mean flow (right, down) from the reference. Fixed camera only, as the following."""
     flow_residual: float | None = None

@@ -118,7 +118,7 @@ def _read_only_uri(path: Path) -> str:
 def copy_database(source: Path, copy: Path, *, without: Collection[str] = ("descriptors",)) -> None:
     """Copy a database to where none is; see `read_database`."""
     try:
-        with closing(sqlite3.connect(copy.as_uri(), uri=True)) as connection:
+        with closing(sqlite3.connect(copy.absolute().as_uri(), uri=True)) as connection:
             connection.execute("ATTACH ? AS source", (_read_only_uri(source),))
             tables = connection.execute(
                 "SELECT name, sql FROM source.sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite_%'"

@@ -39,7 +39,7 @@ _NEAR, _COLMAP_SIDE = 1.5, 3200
 """Pixels."""
 _FOUND_AGAIN = 0.15
 """Part of the keypoints, over what is found by chance."""
-_MORE_STRUCTURE = 0.65
+_MORE_STRUCTURE = 0.6
 """Part of the keypoints; half by chance."""
 
 

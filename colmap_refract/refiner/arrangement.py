@@ -348,7 +348,11 @@ def _check_counts(
 
 
 def _fix_camera(observations: Observations, reference: int, move_points: bool) -> tuple[Observations, Index]:
-    """One pose per rig: the reference image's, and for further rigs that of their first frame.
+    """One pose for all frames, the reference image's; among rigs of several sensors, one for each rig.
+
+    A rig of one camera says nothing of where that camera stands: COLMAP makes one for every camera, and a camera for
+    every image of which it is not told otherwise. Where each rig has its own pose, a further one gets that of its
+    first frame.
 
     Points are put at their depth from that pose along the median direction they are seen in, since poses
     that a mapper made up for a camera that did not move have put them anywhere.
@@ -356,6 +360,8 @@ def _fix_camera(observations: Observations, reference: int, move_points: bool) -
     frames = observations.image_frame
     frame_rig = np.zeros(len(observations.frame_ids), dtype=np.int64)
     frame_rig[frames] = observations.image_rig
+    if len(observations.image_ids) == len(observations.frame_ids) and not _has_sensor_poses(observations):
+        frame_rig[:] = 0
     rigs = np.unique(frame_rig)
     frame_pose = np.searchsorted(rigs, frame_rig)
     keeper = np.array([int(np.flatnonzero(frame_pose == p)[0]) for p in range(len(rigs))])
@@ -384,6 +390,11 @@ def _fix_camera(observations: Observations, reference: int, move_points: bool) -
         raise RefractError("the points lie at the projection centre; give the model a depth (any constant will do)")
     away = np.clip(away, 0.3 * typical, 3.0 * typical)
     return replace(fixed, points=centers[first] + away[:, None] * middle), frame_pose
+
+
+def _has_sensor_poses(observations: Observations) -> bool:
+    """Whether an image comes from a sensor that is not its rig's reference."""
+    return bool(observations.sensor_translation.any() or (observations.sensor_rotation != np.eye(3)).any())
 
 
 def segment_median(values: Array, start: Index) -> Array:

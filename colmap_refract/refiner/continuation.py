@@ -36,6 +36,8 @@ _WIDE_LOSS = 4.0
 """Least scale, px, of the Cauchy loss on the way."""
 _ANCHORS = (1e6, 1.0, 1e-2, 1e-4, 0.0)
 """Proximal weights, in units of a point's own curvature, for a camera that does not move."""
+_ACROSS = 1e-3
+"""Proximal weight that keeps a point's depth, which no parallax tells, and leaves it free across its rays."""
 _PLANE_DEVIATIONS = (0.1, 1.0, 10.0)
 """Of normal priors on moving planes, radians and units of the solve for residuals of one px, let loose in turn."""
 _OPEN_RATIOS = (0.5, 0.15)
@@ -437,6 +439,26 @@ def _fixed_camera(
     settings: SolverSettings,
     on_progress: Callable[[Progress], None] | None,
 ) -> Start | None:
+    """Points behind the planes at first; where that is not enough, also from where they are given.
+
+    A narrow view hardly tells a plane's distance until its tilt is right, and has a minimum that only the second
+    way avoids.
+    """
+    start = _untie(_behind_planes(problem, settings), ratio, settings, on_progress)
+    plausible = start is not None and start.sound and estimate_noise(start.problem) < _PLAUSIBLE_NOISE
+    if plausible and view_deg(problem) >= NARROW_VIEW_DEG:
+        return start
+    other = _untie(problem, ratio, settings, on_progress)
+    found = [each for each in (start, other) if each is not None]
+    return min(found, key=lambda each: (not each.sound, each.cost), default=None)
+
+
+def _untie(
+    problem: Problem,
+    ratio: float,
+    settings: SolverSettings,
+    on_progress: Callable[[Progress], None] | None,
+) -> Start | None:
     """Equal planes give a fixed camera no parallax, so each point is tied to where it was, less and less."""
     adjusted = None
     for weight in _ANCHORS:
@@ -458,6 +480,26 @@ def _fixed_camera(
         problem = replace(problem, state=adjusted.state, points=adjusted.points)
     assert adjusted is not None
     return _turned_over(problem, ratio, adjusted, settings, on_progress)
+
+
+def _behind_planes(problem: Problem, settings: SolverSettings) -> Problem:
+    """The problem with each point moved across to where its rays lead behind the planes as they stand.
+
+    Points that were put where straight rays lead are farther off than the tilts of the planes tell. Held there,
+    they draw the planes to themselves, where nothing is refracted, and on to either side.
+    """
+    all_planes = np.ones_like(problem.held.normals)
+    standing = replace(
+        problem.held,
+        poses=np.ones_like(problem.held.poses),
+        normals=all_planes,
+        distances=all_planes,
+        index=True,
+        lens=True,
+    )
+    problem = _widened(problem, "huber")
+    moved = adjust(replace(problem, held=standing), settings, anchor_weights=_ACROSS * _curvature(problem))
+    return problem if moved.termination == "failure" else replace(problem, points=moved.points)
 
 
 def _curvature(problem: Problem) -> Array:

@@ -220,8 +220,10 @@ def _solve(
     # The start comes from a few tracks, or from others: what it finds wrong by little may be right.
     limit = _FIRST_FILTER * options.filter_max_reproj_error
     narrow = view_deg(selection.problem) < NARROW_VIEW_DEG
-    if narrow:
-        # Planes are hardly determined, and do not tell a point's side: what is clearly better seen straight is dry.
+    by_fit = narrow or options.scenario == "fixed_camera"
+    if by_fit:
+        # Planes hardly known do not tell a point's side, nor does a depth that a camera at rest has of a wrong match:
+        # what is clearly better seen straight is dry.
         errors = reprojection_errors(selection.problem, selection.arrangement.observations)
         doubtful = limit == 0 or (errors > limit).mean() > _NEGLIGIBLE_CHANGE
         wet = label_by_fit(selection.problem, doubtful=bool(doubtful))
@@ -238,7 +240,8 @@ def _solve(
         selection = selection.solved(replace(problem, state=adjustment.state, points=adjustment.points))
         selection, moved = selection.relifted()
         wet = label_by_fit(selection.problem) if narrow else label_wet(selection.problem)
-        if not narrow and num_relabelled < _NUM_RELABEL_ROUNDS and selection.changes_sides(wet):
+        relabels = not by_fit and adjustment.termination != "failure" and num_relabelled < _NUM_RELABEL_ROUNDS
+        if relabels and selection.changes_sides(wet):
             # Planes that were found with points on the wrong side are off, and what is right looks wrong.
             selection = selection.relabelled(wet)
             num_relabelled += 1

@@ -90,6 +90,17 @@ class Selection:
         problem = replace(problem, tracks=tracks, state=state)
         return replace(self, arrangement=arrangement, problem=problem), largest > _LENS_MOVES
 
+    def changes_sides(self, wet: NDArray[np.bool_]) -> bool:
+        """Whether an observation that takes part is on another side by `wet` (N,)."""
+        return bool((wet != self.problem.tracks.wet)[self.keep].any())
+
+    def relabelled(self, wet: NDArray[np.bool_]) -> Selection:
+        """The same observations, with those that `wet` (N,) marks taken to be of points in the water."""
+        problem = self.problem
+        if (wet == problem.tracks.wet).all():
+            return self
+        return replace(self, problem=retriangulate(replace(problem, tracks=problem.tracks._replace(wet=wet))))
+
     def filtered(
         self, wet: NDArray[np.bool_], settings: SolverSettings, max_reproj_error: float
     ) -> tuple[Selection, float]:
@@ -108,8 +119,7 @@ class Selection:
         """
         problem = self.problem
         relabelled = wet != problem.tracks.wet
-        if relabelled.any():
-            problem = retriangulate(replace(problem, tracks=problem.tracks._replace(wet=wet)))
+        problem = self.relabelled(wet).problem
         if relabelled.any() or not self.keep.all():
             problem = replace(problem, points=settle_points(problem, settings))
         marks = filter_observations(
