@@ -115,9 +115,8 @@ def camera_key(camera: pycolmap.Camera) -> list[Any]:
 def count_rows(path: Path, query: str) -> int | None:
     """Result of a query while another process writes the database; None if it cannot be had just now."""
     try:
-        # Not mode=ro: that leaves SQLite's auxiliary files behind if the other process ends meanwhile.
-        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=rw", uri=True, timeout=5)) as database:
-            database.execute("PRAGMA query_only = 1")
+        # COLMAP waits for nobody: a connection that could write might lock a database that it is about to open.
+        with closing(read_only(path)) as database:
             return int(database.execute(query).fetchone()[0])
     except sqlite3.Error:
         return None
