@@ -19,6 +19,7 @@ import pycolmap
 from tables import RESULTS, ProgressLine, publish, table
 
 from colmap_refract.cli import main as colmap_refract
+from colmap_refract.files.sidecar import read_sidecar
 from colmap_refract.interface import Layers
 from colmap_refract.options import Scenario
 from colmap_refract.simulation import SceneOptions
@@ -30,7 +31,6 @@ LEAST_REGISTERED = 0.95
 BOUND_LIMIT = 1.5
 GAIN_LIMIT = 10.0
 CONSTANT_DEPTH_LIMIT = 5.0
-DRY_LIMIT = 1.05
 TILTS = (1.5, 3.0, 8.0)
 CAMERA = {"camera_model": "OPENCV", "width": 1000, "height": 750, "focal_length": 800.0}
 
@@ -47,7 +47,7 @@ class Case:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What came of a case; `refined` is None where the refiner found nothing to refine, and said so in `refusal`."""
+    """What came of a case; `refined` is None where the refiner failed. `said`: its error, or its warnings."""
 
     case: Case
     num_images: int
@@ -55,7 +55,7 @@ class Outcome:
     seconds: float
     before: Judgement
     refined: Judgement | None
-    refusal: str = ""
+    said: str
 
 
 def cases(num_images: int, seed: int) -> list[Case]:
@@ -102,7 +102,7 @@ def run(case: Case, folder: Path) -> Outcome:
         seconds=seconds,
         before=_judge(model, truth),
         refined=_judge(pycolmap.Reconstruction(refined), truth) if refined.exists() else None,
-        refusal=said,
+        said=said or " ".join(read_sidecar(refined).solver["warnings"]),
     )
 
 
@@ -159,26 +159,29 @@ def fixed_row(outcome: Outcome) -> list[str]:
 
 
 def dry_row(outcome: Outcome) -> list[str]:
-    said = outcome.refusal or "refined"
     return [
         f"{outcome.num_registered} / {outcome.num_images}",
         str(outcome.before.num_points),
         f"{1e3 * outcome.before.rmse:.2f}",
         f"{1e3 * rms_bound(outcome.before):.2f}",
-        said.replace("\n", " ").replace("|", "/"),
+        outcome.said.replace("\n", " ").replace("|", "/") or "nothing",
     ]
 
 
 def missed(outcome: Outcome) -> list[str]:
     """The limits that an outcome did not keep."""
     name, after, before = outcome.case.name, outcome.refined, outcome.before
-    if outcome.case.dry:
-        return []
     found = []
     if outcome.num_registered < LEAST_REGISTERED * outcome.num_images:
         found.append(f"{name}: {outcome.num_registered} of {outcome.num_images} images registered")
+    if outcome.case.dry:
+        if before.rmse > BOUND_LIMIT * rms_bound(before):
+            found.append(f"{name}: {before.rmse / rms_bound(before):.2f} x the bound, {BOUND_LIMIT:g} is the limit")
+        if after is not None and "Straight rays explain the images better" not in outcome.said:
+            found.append(f"{name}: an interface was found where there is none, and nothing was said")
+        return found
     if after is None:
-        return [*found, f"{name}: not refined ({outcome.refusal})"]
+        return [*found, f"{name}: not refined ({outcome.said})"]
     if outcome.case.scene.scenario == "fixed_camera":
         gain = after.constant_depth_rmse / after.depth_rmse_best90
         if gain < CONSTANT_DEPTH_LIMIT:
