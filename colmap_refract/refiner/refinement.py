@@ -52,7 +52,10 @@ _NUM_RELABEL_ROUNDS = 20
 """Solves for points that change sides, besides those for the filter."""
 _FIRST_FILTER = 2.0
 """Times the user's limit, before the first solve of all tracks."""
+_TRUSTED = 0.8
+"""Part of the observations that must fit the start for its planes to tell which points are dry."""
 _NUM_FINISHES = 3
+"""Solves that go on where a solver stopped early."""
 _FINISHED = 5e-5
 """Part of the cost that a Newton step would still gain: small steps along a valley look like an end."""
 _FINE = 1e-6
@@ -220,16 +223,17 @@ def _solve(
     # The start comes from a few tracks, or from others: what it finds wrong by little may be right.
     limit = _FIRST_FILTER * options.filter_max_reproj_error
     narrow = view_deg(selection.problem) < NARROW_VIEW_DEG
-    by_fit = narrow or options.scenario == "fixed_camera"
-    if by_fit:
+    geometric = not narrow and options.scenario != "fixed_camera"
+    begun = selection
+    if geometric:
+        selection, _ = begun.filtered(label_wet(begun.problem), settings, limit)
+        geometric = bool(selection.keep.mean() > _TRUSTED)
+    if not geometric:
         # Planes hardly known do not tell a point's side, nor does a depth that a camera at rest has of a wrong match:
         # what is clearly better seen straight is dry.
-        errors = reprojection_errors(selection.problem, selection.arrangement.observations)
+        errors = reprojection_errors(begun.problem, begun.arrangement.observations)
         doubtful = limit == 0 or (errors > limit).mean() > _NEGLIGIBLE_CHANGE
-        wet = label_by_fit(selection.problem, doubtful=bool(doubtful))
-    else:
-        wet = label_wet(selection.problem)
-    selection, _ = selection.filtered(wet, settings, limit)
+        selection, _ = begun.filtered(label_by_fit(begun.problem, doubtful=bool(doubtful)), settings, limit)
     num_filtered = num_relabelled = 0
     while True:
         stage = "Refractive bundle adjustment" + (f", filtered {num_filtered + 1} times" if num_filtered else "")
@@ -240,7 +244,7 @@ def _solve(
         selection = selection.solved(replace(problem, state=adjustment.state, points=adjustment.points))
         selection, moved = selection.relifted()
         wet = label_by_fit(selection.problem) if narrow else label_wet(selection.problem)
-        relabels = not by_fit and adjustment.termination != "failure" and num_relabelled < _NUM_RELABEL_ROUNDS
+        relabels = geometric and adjustment.termination != "failure" and num_relabelled < _NUM_RELABEL_ROUNDS
         if relabels and selection.changes_sides(wet):
             # Planes that were found with points on the wrong side are off, and what is right looks wrong.
             selection = selection.relabelled(wet)
