@@ -128,3 +128,28 @@ def test_what_cannot_be_averaged() -> None:
             RefinerOptions(scenario="moving_interface", average_groups=True),
             notes=ImageNotes(interface_groups=groups),
         )
+
+
+def test_one_camera_per_image_makes_no_difference() -> None:
+    """COLMAP makes a camera and a rig for every image of which it is not told otherwise."""
+    model = capture().reconstruction
+    apart = pycolmap.Reconstruction()
+    camera = model.camera(1)
+    for image_id, image in sorted(model.images.items()):
+        own = pycolmap.Camera(camera.todict())
+        own.camera_id = image_id
+        apart.add_camera_with_trivial_rig(own)
+        keypoints = [pycolmap.Point2D(point.xy) for point in image.get_observation_points2D()]
+        bare = pycolmap.Image(image.name, keypoints, camera_id=image_id, image_id=image_id)
+        apart.add_image_with_trivial_frame(bare, image.cam_from_world())
+    for point in model.points3D.values():
+        elements = [(e.image_id, e.point2D_idx) for e in point.track.elements]
+        places = [
+            (i, int(np.flatnonzero(np.array(model.image(i).get_observation_point2D_idxs()) == k)[0]))
+            for i, k in elements
+        ]
+        apart.add_point3D(point.xyz, pycolmap.Track([pycolmap.TrackElement(*place) for place in places]))
+    together = average_groups(read_observations(model), OPTIONS, groups_of(model)).observations
+    found = average_groups(read_observations(apart), OPTIONS, groups_of(apart)).observations
+    assert len(found.image) == len(together.image)
+    np.testing.assert_allclose(np.sort(found.pixel[:, 0]), np.sort(together.pixel[:, 0]), atol=1e-9)

@@ -360,7 +360,7 @@ def _fix_camera(observations: Observations, reference: int, move_points: bool) -
     frames = observations.image_frame
     frame_rig = np.zeros(len(observations.frame_ids), dtype=np.int64)
     frame_rig[frames] = observations.image_rig
-    if len(observations.image_ids) == len(observations.frame_ids) and not _has_sensor_poses(observations):
+    if one_pose_for_all(observations):
         frame_rig[:] = 0
     rigs = np.unique(frame_rig)
     frame_pose = np.searchsorted(rigs, frame_rig)
@@ -392,9 +392,10 @@ def _fix_camera(observations: Observations, reference: int, move_points: bool) -
     return replace(fixed, points=centers[first] + away[:, None] * middle), frame_pose
 
 
-def _has_sensor_poses(observations: Observations) -> bool:
-    """Whether an image comes from a sensor that is not its rig's reference."""
-    return bool(observations.sensor_translation.any() or (observations.sensor_rotation != np.eye(3)).any())
+def one_pose_for_all(observations: Observations) -> bool:
+    """Whether the frames of a fixed camera share one pose: no frame has two images, nor an image a pose in its rig."""
+    moved = observations.sensor_translation.any() or (observations.sensor_rotation != np.eye(3)).any()
+    return len(observations.image_ids) == len(observations.frame_ids) and not moved
 
 
 def segment_median(values: Array, start: Index) -> Array:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from colmap_refract.errors import RefractError
 from colmap_refract.estimator.scenario import Index
 from colmap_refract.options import RefinerOptions
-from colmap_refract.refiner.arrangement import segment_median
+from colmap_refract.refiner.arrangement import one_pose_for_all, segment_median
 from colmap_refract.refiner.observations import Observations, lift
 
 _OUTLIER = 4.0
@@ -108,10 +108,11 @@ def average_groups(observations: Observations, options: RefinerOptions, groups: 
 
 
 def _image_groups(observations: Observations, groups: Mapping[str, str]) -> Index:
-    """(I,) a number for each image's group within its rig; one of its own for an image without a group."""
+    """(I,) a number for each image's group, within its rig where rigs have poses; its own where it has no group."""
+    rigs = np.zeros_like(observations.image_rig) if one_pose_for_all(observations) else observations.image_rig
     names = [
         (int(rig), groups.get(name, f"image {name}"), name in groups)
-        for name, rig in zip(observations.image_names, observations.image_rig, strict=True)
+        for name, rig in zip(observations.image_names, rigs, strict=True)
     ]
     _, number = np.unique([repr(name) for name in names], return_inverse=True)
     return np.asarray(number, dtype=np.int64)
