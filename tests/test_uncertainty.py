@@ -34,13 +34,17 @@ def photographed_again(capture: Capture, seed: int) -> Capture:
 
 
 def true_size(result: Refinement, capture: Capture) -> float:
-    """What brings the result to the truth's size: by the camera centres, or by the planes if there is but one."""
+    """What brings the result to the truth's size: by the camera centres, or by the points if there is but one."""
     truth = [image.projection_center() for _, image in sorted(capture.reconstruction.images.items())]
     found = [image.projection_center() for _, image in sorted(result.reconstruction.images.items())]
     if capture.scenario == "fixed_camera":
-        distances = np.array([entry.distance for entry in result.sidecar.images.values()])
-        true_distances = np.array([distance for _, distance in capture.planes.values()])
-        return float(distances @ true_distances / (distances @ distances))
+        # All cameras stand at one place, by which the result was not moved.
+        true_points, points = capture.reconstruction.points3D, result.reconstruction.points3D
+        logs = [
+            np.log(np.linalg.norm(true_points[i].xyz - truth[0]) / np.linalg.norm(points[i].xyz - found[0]))
+            for i in points
+        ]
+        return float(np.exp(np.mean(logs)))
     return float(np.linalg.norm(truth - np.mean(truth, axis=0)) / np.linalg.norm(found - np.mean(found, axis=0)))
 
 

@@ -1,14 +1,15 @@
 """How well a solution is determined: covariances of the camera side, from the reduced system.
 
 Seven directions (a similarity of the world) change no observation and have no variance of their own; the
-covariance is the one in which the poses as a whole stay in place (inner constraints), or the planes where
-the poses are held. A rig with a baseline fixes the scale: then there are six. (So does a wall of known thickness, in
-principle, but so badly that an adjustment holds the size; it counts as unseen here.)
+covariance is the one in which the poses as a whole stay in place (inner constraints), or, where the poses are
+held, as with a fixed camera, the points' mean distance: the planes' own would hide how badly all distances are
+known. A rig with a baseline fixes the scale: then there are six. (So does a wall of known thickness, in principle,
+but so badly that an adjustment holds the size; it counts as unseen here.)
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sp
@@ -16,11 +17,19 @@ from numpy.typing import NDArray
 from scipy.linalg import null_space
 from scipy.sparse.linalg import splu
 
-from colmap_refract.estimator.chunk import Problem, split
-from colmap_refract.estimator.elimination import MEDIUM, PLANE, POSE
+from colmap_refract.estimator.adjustment import SolverSettings, settle_points
+from colmap_refract.estimator.chunk import Problem, change_of, slot_width, split
+from colmap_refract.estimator.elimination import MEDIUM, PLANE, POSE, Tracks
+from colmap_refract.estimator.scenario import apply
 from colmap_refract.interface import Array, tangent_basis
 
 Key = tuple[int, int]
+
+_STEP = 1e-4
+"""Radians, or of the median depth: small against what moves a point by much, large against how well it is settled."""
+_FOLLOWED_POINTS = 200
+_MOST_FOLLOWED = 600
+"""Unknowns of a held camera's planes, each of which costs a solve of the followed points."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +38,7 @@ class Uncertainty:
 
     Attributes:
         normal: (B,) of each plane's normal, radians (the larger axis of its ellipse).
-        distance: (B,) of each plane's distance, units of the solve, the poses staying in place.
+        distance: (B,) of each plane's distance, units of the solve; NaN if there are too many planes to say so.
         index: of the refractive index, NaN where it was held.
         index_correlation: largest correlation of the index with the planes.
         decrement: what Newton's method would still gain, over the cost: a measure of convergence without units.
@@ -98,6 +107,38 @@ def _fixed_columns(problem: Problem, columns: dict[Key, int]) -> NDArray[np.int6
     return np.array(fixed, dtype=np.int64)
 
 
+def _growth_of_points(problem: Problem, keys: list[Key], columns: dict[Key, int], num_columns: int) -> Array:
+    """How the mean log distance of the points from a held camera follows each free change (num_columns,).
+
+    By forward differences, on some of the points.
+    """
+    tracks, state = problem.tracks, problem.state
+    chosen = np.unique(np.linspace(0, len(problem.points) - 1, min(_FOLLOWED_POINTS, len(problem.points))).astype(int))
+    lengths = np.diff(tracks.start)[chosen]
+    start = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
+    take = np.arange(start[-1]) + np.repeat(tracks.start[chosen] - start[:-1], lengths)
+    few = replace(
+        problem,
+        tracks=Tracks(start, *(part[take] for part in tracks[1:])),
+        points=problem.points[chosen],
+    )
+    settings = SolverSettings(num_threads=1)
+    center = -state.rotation[0].T @ state.translation[0]
+
+    def size(points: Array) -> float:
+        return float(np.log(np.linalg.norm(points - center, axis=1)).mean())
+
+    settled = settle_points(few, settings)
+    growth = np.zeros(num_columns)
+    for key in keys:
+        for j in range(slot_width(key[0], state)):
+            step = np.zeros(slot_width(key[0], state))
+            step[j] = _STEP
+            moved = replace(few, state=apply(state, change_of(state, [(key, step)])), points=settled)
+            growth[columns[key] + j] = (size(settle_points(moved, settings)) - size(settled)) / _STEP
+    return growth
+
+
 def estimate_uncertainty(problem: Problem) -> Uncertainty:
     """Covariances of planes and index at a solution.
 
@@ -145,9 +186,15 @@ def estimate_uncertainty(problem: Problem) -> Uncertainty:
     scale = 1.0 / np.sqrt(diagonal)
     scaled = sp.csc_array(sp.diags_array(scale) @ hessian @ sp.diags_array(scale))
     directions = gauge(problem, keys, columns, n)[free]
-    # Inner constraints on the poses; on everything where no pose is free.
+    # Inner constraints on the poses; where no pose is free, on the points.
     on_poses = np.concatenate([np.full(widths[key], key[0] == POSE) for key in keys])[free]
-    constraint = directions * (on_poses if on_poses.any() else np.ones_like(on_poses))[:, None] * scale[:, None]
+    size_known = True
+    if on_poses.any() or not directions.shape[1]:
+        constraint = directions * on_poses[:, None] * scale[:, None]
+    elif len(free) <= _MOST_FOLLOWED:
+        constraint = (_growth_of_points(problem, keys, columns, n)[free] * scale)[:, None]
+    else:
+        constraint, size_known = directions * scale[:, None], False
     norms = np.linalg.norm(constraint, axis=0)
     constraint = constraint[:, norms > 0] / norms[norms > 0]
     m = constraint.shape[1]
@@ -184,7 +231,7 @@ def estimate_uncertainty(problem: Problem) -> Uncertainty:
             continue
         if at[0] >= 0:
             normal[b] = np.sqrt(np.linalg.eigvalsh(block[:2, :2])[-1])
-        if at[2] >= 0:
+        if at[2] >= 0 and size_known:
             distance[b] = np.sqrt(variance[-1])
     index, correlation = np.nan, np.nan
     if (MEDIUM, 0) in columns:
