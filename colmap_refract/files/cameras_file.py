@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import struct
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -75,6 +76,26 @@ def fit_to_size(camera: pycolmap.Camera, width: int, height: int) -> pycolmap.Ca
         )
     fitted.rescale(width, height)
     return fitted
+
+
+def known_camera(camera: pycolmap.Camera, cameras: Mapping[int, pycolmap.Camera], user: str) -> pycolmap.Camera:
+    """Which of the given intrinsics are a camera's: those of its id; a single one stands for all, whatever its id.
+
+    Args:
+        camera: of the model or the database.
+        cameras: given intrinsics by camera id.
+        user: who uses the camera, for the message: 'the model'.
+
+    Raises:
+        RefractError: they have no such camera.
+    """
+    known = next(iter(cameras.values())) if len(cameras) == 1 else cameras.get(camera.camera_id)
+    if known is None:
+        raise RefractError(
+            f"the given intrinsics have no camera {camera.camera_id}, which {user} uses; they have "
+            f"{', '.join(str(i) for i in sorted(cameras))}"
+        )
+    return known
 
 
 def cameras_from_binary(file: Path) -> dict[int, pycolmap.Camera]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_refract.errors import RefractError
-from colmap_refract.files.cameras_file import fit_to_size
+from colmap_refract.files.cameras_file import fit_to_size, known_camera
 from colmap_refract.mapping.database import Correspondences, read_database
 from colmap_refract.mapping.tracks import Tracks
 from colmap_refract.refiner.observations import Observations, lift
@@ -166,13 +166,7 @@ def put_into_model(model: pycolmap.Reconstruction, start: Posed) -> pycolmap.Rec
 
 
 def _calibrated(camera: pycolmap.Camera, cameras: Mapping[int, pycolmap.Camera]) -> pycolmap.Camera:
-    known = next(iter(cameras.values())) if len(cameras) == 1 else cameras.get(camera.camera_id)
-    if known is None:
-        raise RefractError(
-            f"the given intrinsics have no camera {camera.camera_id}, which the database uses; they have "
-            f"{', '.join(str(i) for i in sorted(cameras))}"
-        )
-    calibrated = fit_to_size(known, camera.width, camera.height)
+    calibrated = fit_to_size(known_camera(camera, cameras, "the database"), camera.width, camera.height)
     calibrated.camera_id = camera.camera_id
     return calibrated
 

@@ -71,7 +71,8 @@ def refine_with_database(
 
     Returns:
         As `refine`; the sidecar's statistics tell what came back: `num_completed_observations`,
-        `num_merged_points3D`, `num_created_points3D`.
+        `num_merged_points3D`, `num_created_points3D`; and `num_dissolved_points3D`, points that were left with
+        too few observations.
 
     Raises:
         RefractError: as `refine`, or the database is not the model's.
@@ -103,14 +104,15 @@ def _of_the_whole(rounds: list[dict[str, Any]], gained: Gain) -> dict[str, Any]:
     """Statistics from before the first round to after the last."""
     first, last = rounds[0], rounds[-1]
     before = {key: value for key, value in first.items() if key.endswith("_before")}
-    left = before["num_points3D_before"] + gained.num_created - gained.num_merged - last["num_points3D"]
+    summed = {key: sum(statistics[key] for statistics in rounds) for key in _SUMMED}
+    gone = before["num_points3D_before"] + gained.num_created - gained.num_merged - last["num_points3D"]
     return {
         **before,
-        **{key: sum(statistics[key] for statistics in rounds) for key in _SUMMED},
+        **summed,
         "num_completed_observations": gained.num_completed,
         "num_merged_points3D": gained.num_merged,
         "num_created_points3D": gained.num_created,
-        "num_dissolved_points3D": left,
+        "num_dissolved_points3D": max(gone - summed["num_filtered_small_angle"], 0),
     }
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from colmap_refract.errors import RefractError
 from colmap_refract.estimator.adjustment import Adjustment, SolverSettings, adjust, settle_points
 from colmap_refract.estimator.chunk import Problem
-from colmap_refract.files.cameras_file import fit_to_size
+from colmap_refract.files.cameras_file import fit_to_size, known_camera
 from colmap_refract.files.model_io import copy_model
 from colmap_refract.files.sidecar import Sidecar
 from colmap_refract.machine import threads
@@ -193,12 +193,7 @@ def _replace_cameras(model: pycolmap.Reconstruction, cameras: Mapping[int, pycol
     """In-air intrinsics in place of the model's: keypoints are raw pixels, so that is sound. What was rescaled."""
     remarks = []
     for camera_id, camera in model.cameras.items():
-        known = next(iter(cameras.values())) if len(cameras) == 1 else cameras.get(camera_id)
-        if known is None:
-            raise RefractError(
-                f"the given intrinsics have no camera {camera_id}, which the model uses; they have "
-                f"{', '.join(str(i) for i in sorted(cameras))}"
-            )
+        known = known_camera(camera, cameras, "the model")
         if (known.width, known.height) != (camera.width, camera.height):
             remarks.append(
                 f"The intrinsics given for camera {camera_id} are for {known.width} x {known.height} pixels and were "

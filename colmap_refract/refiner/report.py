@@ -45,6 +45,7 @@ def _model(sidecar: Sidecar) -> list[str]:
     filtered = [
         (s.get("num_filtered_large_error"), "observations with a large error"),
         (s.get("num_filtered_small_angle"), "points with a small angle"),
+        (s.get("num_dissolved_points3D"), "points left with too few observations"),
         (s.get("num_unusable_observations"), "observations that no two images could use"),
     ]
     removed = ", ".join(f"{count} {what}" for count, what in filtered if count) or "nothing"
@@ -58,7 +59,6 @@ def _model(sidecar: Sidecar) -> list[str]:
         (s.get("num_completed_observations"), "observations added"),
         (s.get("num_merged_points3D"), "points merged into others"),
         (s.get("num_created_points3D"), "points created"),
-        (s.get("num_dissolved_points3D"), "points given up"),
     ]
     if any(count is not None for count, _ in gained):
         lines.append(
