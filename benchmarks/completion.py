@@ -78,7 +78,9 @@ def mapped(capture: Capture, folder: Path, wrong: float) -> tuple[pycolmap.Recon
     names = sorted(image.name for image in capture.reconstruction.images.values())
     pairs = folder / "pairs.txt"
     pairs.write_text("\n".join(f"{a} {b}" for k, a in enumerate(names) for b in names[k + 1 :]))
-    pycolmap.verify_matches(database, pairs)
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = 0
+    pycolmap.verify_matches(database, pairs, verification)
     options = pycolmap.IncrementalPipelineOptions()
     options.ba_refine_focal_length = options.ba_refine_extra_params = False
     options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
