@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -62,11 +63,38 @@ def align_to_best(found: Array, true: Array) -> tuple[Array, NDArray[np.int64]]:
     return aligned, best
 
 
+def slope_error(normals_in_cam: Mapping[int, Array], capture: Capture) -> float:
+    """Root mean square angle between recovered normals of the surface and the true ones, degrees.
+
+    Args:
+        normals_in_cam: per image id, (n, 3) for each keypoint, of any length, from the camera into the water, camera
+            frame. Images that are not there are left out, and so are rows that are not a number.
+
+    Raises:
+        RefractError: an image without a true surface, another number of keypoints, or no normal at all.
+    """
+    squares = []
+    for image_id, found in normals_in_cam.items():
+        if image_id not in capture.surfaces:
+            raise RefractError(f"image {image_id} has no true surface")
+        true = capture.normals_in_cam(image_id)
+        if np.shape(found) != true.shape:
+            raise RefractError(f"image {image_id} has {len(true)} keypoints, but normals of shape {np.shape(found)}")
+        # Small angles have no digits left in their cosine.
+        angle = np.arctan2(np.linalg.norm(np.cross(found, true), axis=1), np.einsum("ij,ij->i", found, true))
+        squares.append(angle[np.isfinite(angle)] ** 2)
+    every = np.concatenate([np.empty(0), *squares])
+    if not every.size:
+        raise RefractError("no normal was recovered: there is nothing to compare with the truth")
+    return float(np.degrees(np.sqrt(np.mean(every))))
+
+
 def noise_bound(capture: Capture) -> float:
     """The Cramer-Rao bound of `point_rmse`, metres: what the pixel noise leaves, however a model is solved.
 
     Known and unknown are what `precision` says; the points are those that have two observations or more which are
-    no outliers, and planes are shared as the scenario says.
+    no outliers, and planes are shared as the scenario says. Waves count as known: with unknown waves, see
+    `bayesian_bound`.
 
     Raises:
         RefractError: fewer than three such points.

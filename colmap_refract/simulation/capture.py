@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_refract.errors import RefractError
 from colmap_refract.interface import Array, Layers, plane_in_world
 from colmap_refract.options import Scenario
 from colmap_refract.simulation import scene
 from colmap_refract.simulation.least_path import least_path_direction
 from colmap_refract.simulation.scene import Plane, SceneOptions, Station
+from colmap_refract.simulation.surface import Surface
+from colmap_refract.simulation.wave_path import least_crossings
 
 if TYPE_CHECKING:
     import pycolmap
@@ -28,13 +31,18 @@ class Capture:
     options: SceneOptions
     reconstruction: pycolmap.Reconstruction
     planes: dict[int, Plane]
-    """Per image id, `(normal_in_cam, distance)`; the normal is (3,)."""
+    """Per image id, `(normal_in_cam, distance)`; the normal is (3,). With waves, their mean plane."""
     pixels: dict[int, Array]
     """Per image id, the exact pixels of its keypoints, (n, 2)."""
     outliers: set[tuple[int, int]]
     """`(image_id, point2D_idx)` of the observations that are random pixels."""
     world_plane: Plane | None
     """`(normal_in_world, offset)` of a static interface."""
+    surfaces: dict[int, Surface] = field(default_factory=dict)
+    """Per image id, the surface in the world, with the waves of its frame if there are any."""
+    crossings: dict[int, Array] = field(default_factory=dict)
+    """Per image id, where the light of each keypoint enters the (first) interface, (n, 3), world frame, metres;
+    not a number for dry points."""
 
     @property
     def scenario(self) -> Scenario:
@@ -43,6 +51,28 @@ class Capture:
     @property
     def layers(self) -> Layers:
         return self.options.layers
+
+    def normals_in_cam(self, image_id: int) -> Array:
+        """True unit normals (n, 3) of the surface where the light of each keypoint of an image crosses it.
+
+        From the camera into the water, camera frame; not a number for dry points.
+        """
+        crossing, surface = self.crossings[image_id], self.surfaces[image_id]
+        if len(surface.waves):
+            normals = np.column_stack([-surface.gradient(crossing[:, :2]), np.ones(len(crossing))])
+            normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        else:
+            normals = np.where(np.isfinite(crossing), surface.normal, np.nan)
+        rotation = self.reconstruction.image(image_id).cam_from_world().rotation.matrix()
+        return np.asarray(normals @ rotation.T)
+
+    def heights(self, image_id: int) -> Array:
+        """How far (n,) the surface is above its mean plane where the light of each keypoint of an image crosses it.
+
+        Metres along the plane's normal, positive towards the camera; not a number for dry points.
+        """
+        surface = self.surfaces[image_id]
+        return np.asarray(surface.offset - self.crossings[image_id] @ surface.normal)
 
 
 def simulate(options: SceneOptions) -> Capture:
@@ -54,19 +84,21 @@ def simulate(options: SceneOptions) -> Capture:
     Raises:
         RefractError: options that contradict each other, or an interface that reaches behind a camera.
     """
-    rng = np.random.default_rng(options.seed)
+    rng, wave_rng = np.random.default_rng(options.seed), np.random.default_rng([options.seed, 1])
     plan = scene.lay_out(options, rng)
     points, cameras, sensors = plan.points, scene.cameras(options), scene.sensors_from_rig(options)
 
     reach = 0.9 * np.hypot(*options.footprint)
-    views = []
+    views: list[_View] = []
     for station in plan.stations:
+        # A rig looks through one surface.
+        surface = _surface(station, options, wave_rng) if station.sensor == 0 else views[-1].surface
         target = plan.targets[station.frame]
         near = np.flatnonzero(np.linalg.norm(points[:, :2] - target, axis=1) < reach)
         in_cam = points[near] @ station.rotation.T + station.translation
-        direction = least_path_direction(in_cam, *station.plane, options.layers)
+        direction, crossing = _look(station, surface, in_cam)
         pixels, visible = _project(station.camera, direction, margin=4 * options.pixel_noise)
-        views.append(_View(station, near[visible], pixels[visible]))
+        views.append(_View(station, surface, near[visible], pixels[visible], crossing[visible]))
 
     num_seen = np.bincount(np.concatenate([view.seen for view in views]), minlength=len(points))
     outliers: set[tuple[int, int]] = set()
@@ -84,6 +116,8 @@ def simulate(options: SceneOptions) -> Capture:
         pixels={image_id: view.pixels for image_id, view in enumerate(views, start=1)},
         outliers=outliers,
         world_plane=_world_plane(plan.stations[0]) if options.scenario == "static_interface" else None,
+        surfaces={image_id: view.surface for image_id, view in enumerate(views, start=1)},
+        crossings={image_id: view.crossings for image_id, view in enumerate(views, start=1)},
     )
 
 
@@ -139,15 +173,47 @@ def ignore_refraction(
 
 
 class _View(NamedTuple):
-    """One image: where it was taken from, the points it sees and their exact pixels (n, 2)."""
+    """One image: where it was taken from and through what, the points it sees, their exact pixels (n, 2) and the
+    places (n, 3) where their light crosses the surface."""
 
     station: Station
+    surface: Surface
     seen: NDArray[np.int64]
     pixels: Array
+    crossings: Array
 
 
 def _world_plane(station: Station) -> Plane:
     return plane_in_world(*station.plane, station.rotation, station.translation)
+
+
+def _surface(station: Station, options: SceneOptions, rng: np.random.Generator) -> Surface:
+    """The interface at the moment that a station's images are taken at."""
+    waves = options.wave_statistics.draw(rng) if options.wave_slope_deg > 0 else np.empty((0, 4))
+    normal, offset = _world_plane(station)
+    return Surface(normal=normal, offset=offset, layers=options.layers, waves=waves)
+
+
+def _look(station: Station, surface: Surface, points_in_cam: Array) -> tuple[Array, Array]:
+    """Directions (n, 3) in which a camera sees points, camera frame, and where that light crosses the surface (n, 3).
+
+    The crossing, in the world, is not a number for dry points; nor is the direction of a wet one that is not seen.
+    """
+    rotation, translation = station.rotation, station.translation
+    center = -rotation.T @ translation
+    if not len(surface.waves):
+        normal, distance = station.plane
+        direction = least_path_direction(points_in_cam, normal, distance, surface.layers)
+        wet = points_in_cam @ normal > distance
+        reach = np.divide(distance, direction @ normal, out=np.full(len(wet), np.nan), where=wet)
+        return direction, center + reach[:, None] * direction @ rotation
+    if not surface.depth_below(center)[0] < 0:
+        raise RefractError("the waves reach above a camera: use less wave_slope_deg or more distance_ratio")
+    points = (points_in_cam - translation) @ rotation
+    crossing = least_crossings(surface, center, points)
+    wet = surface.depth_below(points) > 0
+    direction = np.where(wet[:, None], (crossing - center) @ rotation.T, points_in_cam)
+    return direction / np.linalg.norm(direction, axis=1, keepdims=True), crossing
 
 
 def _project(camera: pycolmap.Camera, directions: Array, *, margin: float) -> tuple[Array, NDArray[np.int64]]:

@@ -6,22 +6,22 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_refract.errors import RefractError
 from colmap_refract.interface import Array, Layers, tangent_basis
 from colmap_refract.options import Scenario
 from colmap_refract.simulation.least_path import least_path_direction
+from colmap_refract.simulation.point_elimination import CorrelatedNoise, Index, eliminate_jointly, eliminate_singly
 
 if TYPE_CHECKING:
     import pycolmap
-
-Index = NDArray[np.int64]
 
 # Of the finite differences, in radians and in camera heights: truncation and rounding leave about ten digits.
 STEP = 1e-5
 # The gauge has singular values of about 1e-11, the weakest combination that means something about 1e-6.
 SMALLEST_SINGULAR = 1e-9
+# Unknown waves hide most of what the pixels tell, but not the errors of the gauge.
+SMALLEST_SINGULAR_CORRELATED = 1e-8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,10 +86,14 @@ class Configuration:
         view = pose[self.image]
         in_cam = np.einsum("nab,nb->na", view[:, :, :3], self.points[self.point] + change[:3]) + view[:, :, 3]
         direction = least_path_direction(in_cam, normal[self.image], distance[self.image], self.layers)
-        pixels = np.empty((len(direction), 2))
+        return self.pixels_of(direction)
+
+    def pixels_of(self, directions: Array) -> Array:
+        """Pixels (N, 2) of the observations' directions (N, 3)."""
+        pixels = np.empty((len(directions), 2))
         for k, camera in enumerate(self.cameras):
             mine = self.camera[self.image] == k
-            pixels[mine] = camera.img_from_cam(direction[mine])
+            pixels[mine] = camera.img_from_cam(directions[mine])
         return pixels
 
     @property
@@ -137,7 +141,9 @@ class Precision:
         return np.asarray(np.sqrt(np.maximum(np.einsum("pi,pij,pj->p", every, self.covariance, every), 0)))
 
 
-def precision(configuration: Configuration) -> Precision:
+def precision(
+    configuration: Configuration, *, noise: CorrelatedNoise | None = None, prior: Array | None = None
+) -> Precision:
     """The Cramer-Rao bound, for a noise of 1 px: what the pixel noise leaves, however a model is solved.
 
     Unknown are the points, a pose per frame (none with a fixed camera, whose one pose makes the world's frame) and
@@ -147,47 +153,55 @@ def precision(configuration: Configuration) -> Precision:
     What the pixels say nothing of counts as known: the gauge, which the alignment takes away, but also the
     depth of a point that a fixed camera sees through one and the same interface only.
 
+    Args:
+        configuration: the truth.
+        noise: of the pixels; independent and of 1 px by default. Correlated, it takes a dense matrix of
+            all observations by all points: 16,000 x 1,200 numbers take seconds.
+        prior: rows (R, C + E), each a combination of frames, planes (as `Configuration.spread_blocks` lays them
+            out) and E further unknowns that is known to a standard deviation of 1.
+
     Raises:
         RefractError: fewer than three points.
     """
-    point, num_points = configuration.point, len(configuration.points)
+    num_points = len(configuration.points)
     if num_points < 3:
         raise RefractError(f"{num_points} points with two observations; an alignment takes three")
     by_point, by_block = _jacobian(configuration)
-
-    # Each point is eliminated from its own rows, and follows a change of the blocks by -follow.
-    normal_matrix = np.zeros((num_points, 3, 3))
-    np.add.at(normal_matrix, point, by_point.mT @ by_point)
-    own = np.linalg.pinv(normal_matrix, rcond=1e-12, hermitian=True)
-    coupling = np.zeros((num_points, 3, by_block.shape[2]))
-    np.add.at(coupling, point, by_point.mT @ by_block)
-    follow = own @ coupling
-    reduced = (by_block - by_point @ follow[point]).reshape(-1, by_block.shape[2])
+    if prior is not None:
+        by_block = np.pad(by_block, ((0, 0), (0, 0), (0, prior.shape[1] - by_block.shape[2])))
+    directions = _similarity_directions(configuration.points)
+    similarity, triangle = np.linalg.qr(directions)
+    if noise is None:
+        own, beside, follow, reduced = eliminate_singly(configuration.point, by_point, by_block, similarity)
+    else:
+        own, beside, follow, reduced = eliminate_jointly(configuration.point, by_point, by_block, similarity, noise)
+    if prior is not None:
+        reduced = np.concatenate([reduced, prior])
 
     # Radians and metres: with columns of one length a small singular value means the gauge. A column that is
     # nothing but rounding stays out.
     length = np.linalg.norm(reduced, axis=0)
     scale = np.divide(1, length, out=np.zeros_like(length), where=length > SMALLEST_SINGULAR * length.max())
     _, singular, vt = np.linalg.svd(np.linalg.qr(reduced * scale, mode="r"), full_matrices=False)
-    kept = singular > SMALLEST_SINGULAR * singular.max()
+    smallest = SMALLEST_SINGULAR if noise is None else SMALLEST_SINGULAR_CORRELATED
+    kept = singular > smallest * singular.max()
     of_blocks = scale[:, None] * vt[kept].T / singular[kept]
-    spread = follow.reshape(3 * num_points, -1) @ of_blocks
+    spread = follow @ of_blocks
 
     # The covariance is own + spread spread^T; this is its diagonal across the similarities.
-    directions = _similarity_directions(configuration.points)
-    similarity, triangle = np.linalg.qr(directions)
     per_point = similarity.reshape(num_points, 3, 7)
-    shared = np.einsum("pik,pij,pjl->kl", per_point, own, per_point)
+    shared = np.einsum("pik,pil->kl", per_point, beside)
     along = similarity.T @ spread
     across = (spread - similarity @ along).reshape(num_points, 3, -1)
-    mixed = own @ per_point @ per_point.mT
+    mixed = beside @ per_point.mT
     covariance = own - mixed - mixed.mT + per_point @ shared @ per_point.mT + across @ across.mT
 
     # The alignment also scales the planes' distances: by minus what the points have grown.
     growth = np.linalg.inv(triangle)[-1]
     by_view, distance = _plane_jacobian(configuration)
-    of_normal = by_view[:, :3] @ of_blocks
-    of_distance = by_view[:, 3] @ of_blocks + distance[:, None] * (growth @ along)
+    of_views = of_blocks[: by_view.shape[2]]
+    of_normal = by_view[:, :3] @ of_views
+    of_distance = by_view[:, 3] @ of_views + distance[:, None] * (growth @ along)
     variance = np.sum(of_distance**2, axis=1) + distance**2 * (growth @ shared @ growth)
     return Precision(
         covariance=covariance,

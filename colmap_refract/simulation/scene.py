@@ -10,6 +10,7 @@ import numpy as np
 from colmap_refract.errors import RefractError
 from colmap_refract.interface import Array, Layers, plane_in_cam, tangent_basis
 from colmap_refract.options import Scenario
+from colmap_refract.simulation.waves import WaveStatistics
 
 if TYPE_CHECKING:
     import pycolmap
@@ -63,6 +64,11 @@ class SceneOptions:
     """Mean angle between the view and the vertical; the images vary by a third of it. 0: nadir only."""
     dry_point_ratio: float = 0.0
     """Part of the points that stand out of the water, on a pier through the middle of the scene."""
+    wave_slope_deg: float = 0.0
+    """Root mean square slope of the waves on the interface, degrees: of the steepest direction, over all places and
+    frames. Each frame has waves of its own. 0: flat."""
+    wavelength: tuple[float, float] = (1.0, 2.5)
+    """Shortest and longest of the waves, metres."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -87,6 +93,19 @@ class SceneOptions:
             raise RefractError(
                 f"a relief of {self.relief:g} m reaches out of the water: give less than twice its depth"
             )
+
+        if not 0 <= self.wave_slope_deg < 90:
+            raise RefractError(f"wave_slope_deg {self.wave_slope_deg:g} is no slope: give 0, a flat interface, or more")
+        _ = self.wave_statistics
+        if self.wave_slope_deg > 0 and self.scenario == "camera_housing":
+            raise RefractError("the port of a camera_housing has no waves: leave wave_slope_deg at 0")
+        if self.wave_slope_deg > 0 and self.layers.thickness:
+            raise RefractError("a wall does not make waves: leave wave_slope_deg at 0, or layers without thickness")
+
+    @property
+    def wave_statistics(self) -> WaveStatistics:
+        """Of the interface's heights and slopes over its mean plane."""
+        return WaveStatistics(rms_slope=float(np.tan(np.radians(self.wave_slope_deg))), wavelength=self.wavelength)
 
     @property
     def camera_height(self) -> float:
@@ -225,7 +244,7 @@ def scene_points(options: SceneOptions, targets: Array, rng: np.random.Generator
     z = options.camera_height + options.floor_relief * (0.7 * hills + 0.3 * rng.uniform(-0.5, 0.5, options.num_points))
     pier = np.argsort(abs(xy[:, 0] - 0.5 * (low + high)[0]))[: round(options.dry_point_ratio * options.num_points)]
     above = 0.25 * np.hypot(*options.footprint) * _largest_slope(options)
-    above = above + options.scene_size * rng.uniform(0.02, 0.08, len(pier))
+    above = above + options.scene_size * rng.uniform(0.02, 0.08, len(pier)) + 3 * options.wave_statistics.rms_height
     z[pier] = options.interface_height - np.minimum(above, 0.6 * options.interface_height)
     return np.column_stack([xy, z])
 
@@ -237,10 +256,17 @@ def world_planes(options: SceneOptions, targets: Array, rng: np.random.Generator
     group = np.arange(count) // shared
     normals = np.column_stack([_largest_slope(options) * _unit_disc(count, rng), np.ones(count)])[group]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    lift = 0.1 * min(0.5 * options.scene_size, options.interface_height) * rng.uniform(-1, 1, count)[group]
+    lift = _largest_lift(options) * rng.uniform(-1, 1, count)[group]
     height = options.interface_height + (0 if options.scenario == "static_interface" else lift)
     pivot = np.column_stack([targets[group * shared], np.broadcast_to(height, count)])
     return normals, np.einsum("ij,ij->i", normals, pivot)
+
+
+def plane_scatter(options: SceneOptions) -> tuple[float, float]:
+    """Standard deviations of what `world_planes` draws: slope along each axis, and lift at the target in metres."""
+    # A uniform disc has a quarter of its squared radius along each axis, and an interval a third of its half's.
+    lift = 0.0 if options.scenario == "static_interface" else _largest_lift(options)
+    return _largest_slope(options) / 2, float(lift / np.sqrt(3))
 
 
 def ports(options: SceneOptions) -> list[Plane]:
@@ -280,6 +306,11 @@ def lay_out(options: SceneOptions, rng: np.random.Generator) -> Arrangement:
 def _largest_slope(options: SceneOptions) -> float:
     """Of a moving interface: its slope is uniform in a disc, so the largest is sqrt(2) of the mean square."""
     return 0.0 if options.scenario == "static_interface" else float(np.tan(np.radians(np.sqrt(2) * options.tilt_deg)))
+
+
+def _largest_lift(options: SceneOptions) -> float:
+    """Of a moving interface from its mean height, metres."""
+    return 0.1 * min(0.5 * options.scene_size, options.interface_height)
 
 
 def _unit_disc(count: int, rng: np.random.Generator) -> Array:

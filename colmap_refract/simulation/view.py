@@ -13,6 +13,7 @@ from colmap_refract.interface import Array, plane_in_cam
 from colmap_refract.simulation.least_path import least_path_direction
 from colmap_refract.simulation.surface import Surface
 from colmap_refract.simulation.terrain import Terrain
+from colmap_refract.simulation.wave_path import stationary_crossings
 
 if TYPE_CHECKING:
     import pycolmap
@@ -103,7 +104,10 @@ def project(view: View, points: ArrayLike, *, near: ArrayLike | None = None) -> 
     if not flat:
         wet = surface.depth_below(xyz) > 0
         start = view.rays(near) if near is not None else directions @ rotation
-        crossing = _crossings(view, xyz[wet], start[wet])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            reach = (surface.offset - view.center @ surface.normal) / (start[wet] @ surface.normal)
+        begin = (view.center + reach[:, None] * start[wet])[:, :2]
+        crossing = stationary_crossings(surface, view.center, xyz[wet], begin)
         directions = in_cam
         directions[wet] = (crossing - view.center) @ rotation.T
     pixels = np.full((len(xyz), 2), np.nan)
@@ -118,58 +122,3 @@ def optics(surface: Surface) -> tuple[Array, Array, Array, Array]:
     media = np.array([1.0, *surface.layers.index])
     plane = np.array([*surface.normal, surface.offset])
     return plane, surface.waves, media, np.array(surface.layers.thickness, dtype=np.float64)
-
-
-def _crossings(view: View, points: Array, start: Array) -> Array:
-    """Where the paths (n, 3) from the camera to points below a wavy surface cross it; not a number if not found.
-
-    Newton's method on the gradient of the optical length by x and y of the crossing, with steps halved until
-    the gradient falls.
-    """
-    surface, center = view.surface, view.center
-    with np.errstate(divide="ignore", invalid="ignore"):
-        reach = (surface.offset - center @ surface.normal) / (start @ surface.normal)
-    place = (center + reach[:, None] * start)[:, :2]
-    mu = surface.layers.refractive_index
-
-    def gradient_at(xy: Array, ends: Array) -> tuple[Array, Array]:
-        slope, bend = surface.gradient(xy), surface.curvature(xy)
-        crossing = np.column_stack([xy, surface.height(xy)])
-        tangents = np.zeros((len(xy), 2, 3))
-        tangents[:, :, :2] = np.eye(2)
-        tangents[:, :, 2] = slope
-        gradient, hessian = np.zeros((len(xy), 2)), np.zeros((len(xy), 2, 2))
-        for end, index in ((center, 1.0), (ends, mu)):
-            arm = crossing - end
-            length = np.linalg.norm(arm, axis=1)[:, None]
-            along = np.einsum("nka,na->nk", tangents, arm / length)
-            gradient += index * along
-            flat = np.einsum("nka,nla->nkl", tangents, tangents) - along[:, :, None] * along[:, None, :]
-            hessian += index * (flat + arm[:, 2, None, None] * bend) / length[:, :, None]
-        return gradient, hessian
-
-    active = np.flatnonzero(np.isfinite(place).all(axis=1))
-    found = np.zeros(len(points), dtype=bool)
-    for _ in range(60):
-        if not active.size:
-            break
-        gradient, hessian = gradient_at(place[active], points[active])
-        size = np.linalg.norm(gradient, axis=1)
-        step = -np.linalg.solve(hessian, gradient[:, :, None])[:, :, 0]
-        factor = np.ones(len(active))
-        for _ in range(30):
-            trial = place[active] + factor[:, None] * step
-            worse = ~(np.linalg.norm(gradient_at(trial, points[active])[0], axis=1) < size) & (size > 1e-14)
-            if not worse.any():
-                break
-            factor[worse] *= 0.5
-        place[active] += factor[:, None] * step
-        length = np.linalg.norm(points[active] - center, axis=1)
-        done = np.linalg.norm(step, axis=1) < 1e-13 * length
-        # A path that cannot be made better any more, but for rounding.
-        done |= (factor < 1e-8) & (size < 1e-12)
-        found[active[done]] = True
-        active = active[~done & (factor > 1e-8)]
-    out = np.column_stack([place, surface.height(place)])
-    out[~found] = np.nan
-    return out
