@@ -18,6 +18,7 @@ from colmap_refract.commands.flow_matcher import FlowMatcher
 from colmap_refract.commands.image_selector import ImageSelector
 from colmap_refract.commands.initial_mapper import InitialMapper
 from colmap_refract.commands.model_analyzer import ModelAnalyzer
+from colmap_refract.commands.point_triangulator import PointTriangulator
 from colmap_refract.commands.refiner import Refiner
 from colmap_refract.commands.simulator import Simulator
 from colmap_refract.errors import RefractError
@@ -58,6 +59,7 @@ _COMMANDS = {
     "image_selector": ImageSelector,
     "initial_mapper": InitialMapper,
     "model_analyzer": ModelAnalyzer,
+    "point_triangulator": PointTriangulator,
     "refiner": Refiner,
     "simulator": Simulator,
 }

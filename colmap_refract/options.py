@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, fields
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -12,8 +12,11 @@ from colmap_refract.errors import RefractError
 from colmap_refract.interface import Layers
 
 Scenario = Literal["moving_interface", "static_interface", "fixed_camera", "camera_housing"]
+ScenarioOrAuto = Literal["auto", "moving_interface", "static_interface", "fixed_camera", "camera_housing"]
+InterfaceShape = Literal["plane", "soft", "auto"]
 Loss = Literal["trivial", "huber", "soft_l1", "cauchy"]
 
+_STEEPEST_DEG, _MOST_WAVE_MODES = 17.0, 200
 _LEAST_INDEX, _LARGEST_INDEX = 0.25, 4.0
 """Of one medium relative to another: beyond, a slip of the decimal point."""
 
@@ -64,14 +67,15 @@ class ImageNotes:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RefinerOptions:
-    """How a model photographed through a plane interface is refined."""
+class RefinerRequest:
+    """How a model photographed through a plane interface is to be refined; the scenario may be left open."""
 
-    scenario: Scenario
+    scenario: ScenarioOrAuto
     """What is shared.
     moving_interface: nothing, each image has its own pose and plane; static_interface: one plane,
     fixed in the world; fixed_camera: one pose, a plane per image; camera_housing: one plane per
-    camera, fixed in the camera."""
+    camera, fixed in the camera. auto (of the refiner): the simplest of these that predicts
+    observations held out from a refinement as well as any; name the scenario if you know it."""
 
     refractive_index: float = 1.333
     """Of the medium the scene is in, relative to the camera's. Fresh water 1.333, sea water 1.340."""
@@ -100,6 +104,24 @@ class RefinerOptions:
     reference_image: str = ""
     """Name of the image that interface_distance and interface_normal speak of.
     A fixed camera keeps its pose. By default the one with most observations."""
+
+    interface_shape: InterfaceShape = "plane"
+    """plane: the interfaces are flat; soft: open water, whose surface waves, differently in every image;
+    auto: what predicts held-out observations best."""
+    wave_slope_deg: float | None = None
+    """Root mean square slope of the waves, over both axes. With soft; estimated by default."""
+    wavelength: float | None = None
+    """Length of the waves, in metres if interface_distance is given, otherwise in units of the model.
+    With soft; estimated by default."""
+    num_wave_modes: int = 36
+    """Unknowns of each image's surface, with soft: its most probable shapes.
+    What they cannot take counts as noise."""
+    level_prior: bool = True
+    """Water is level on average: with soft, the planes of a moving interface scatter about one."""
+    level_tilt_deg: float | None = None
+    """Standard deviation of the planes' tilt, in each of two directions. Estimated by default."""
+    level_lift: float | None = None
+    """Standard deviation of the planes' height, over the interface distance. Estimated by default."""
 
     average_groups: bool = False
     """Average the keypoints of each interface group per track, weighted by their spread.
@@ -153,8 +175,29 @@ class RefinerOptions:
                 raise RefractError(f"a refractive index of {index:g} is no medium's: water has 1.333, glass 1.52")
         if self.num_threads == 0 or self.num_threads < -1:
             raise RefractError(f"num_threads {self.num_threads}: give 1 or more, or -1 for one per core")
+        if self.wave_slope_deg is not None and not 0 < self.wave_slope_deg <= _STEEPEST_DEG:
+            raise RefractError(
+                f"wave_slope_deg {self.wave_slope_deg:g}: give degrees from just over 0 to {_STEEPEST_DEG:g}, where "
+                "waves break"
+            )
+        if self.wavelength is not None and not 0 < self.wavelength < np.inf:
+            raise RefractError(f"wavelength {self.wavelength:g} is not positive: give the length from crest to crest")
+        if not 4 <= self.num_wave_modes <= _MOST_WAVE_MODES:
+            raise RefractError(
+                f"num_wave_modes {self.num_wave_modes}: give 4 to {_MOST_WAVE_MODES}; the default is enough for a "
+                "surface that is smooth over the view"
+            )
+        for name in ("level_tilt_deg", "level_lift"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < np.inf:
+                raise RefractError(f"{name} {value:g} is not a spread: give a number > 0, or level_prior 0")
         if self.random_seed < 0:
             raise RefractError(f"random_seed {self.random_seed}: give a number from 0 on")
+
+    def with_scenario(self, scenario: Scenario) -> RefinerOptions:
+        """The same with the scenario named."""
+        rest = {part.name: getattr(self, part.name) for part in fields(RefinerRequest) if part.name != "scenario"}
+        return RefinerOptions(scenario=scenario, **rest)
 
     @property
     def layers(self) -> Layers:
@@ -162,6 +205,25 @@ class RefinerOptions:
         return Layers(
             thickness=tuple(self.layer_thickness), index=(*self.layer_refractive_index, self.refractive_index)
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefinerOptions(RefinerRequest):
+    """How a model photographed through a plane interface is refined."""
+
+    scenario: Scenario
+    """What is shared.
+    moving_interface: nothing, each image has its own pose and plane; static_interface: one plane,
+    fixed in the world; fixed_camera: one pose, a plane per image; camera_housing: one plane per
+    camera, fixed in the camera."""
+
+    def __post_init__(self) -> None:
+        if self.scenario not in get_args(Scenario):
+            raise RefractError(
+                f"scenario '{self.scenario}' is none of {', '.join(get_args(Scenario))}: name one, or have "
+                "choose_scenario find it"
+            )
+        super().__post_init__()
 
     @property
     def min_tri_angle(self) -> float:

@@ -236,8 +236,46 @@ def test_other_forms_of_a_model(run: Run, pristine: Path, tmp_path: Path, form: 
     }
 
 
+def test_scenario_auto(run: Run, model: Path, tmp_path: Path) -> None:
+    arguments = refiner(model, tmp_path / "auto", "--refractive_index", "1.34", scenario="auto")
+    lines = run(arguments).splitlines()
+    begin = next(k for k, line in enumerate(lines) if line.startswith("==="))
+    comparison = "\n".join(lines[:begin])
+    # Unknowns and error; a plane fixed in a camera that looks about is found nowhere, which is said instead.
+    for scenario, error in (("static_interface", "[0-9.]+"), ("moving_interface", "[0-9.]+"), ("camera_housing", "-")):
+        assert len(re.findall(rf"^{scenario} +[0-9]+ +{error} ", comparison, re.MULTILINE)) == 1
+    assert re.search("^camera_housing: the interface ran", comparison, re.MULTILINE)
+    for word in ("unknowns", "[px]", "[s]", "static_interface predicts"):
+        assert word in comparison
+    assert lines[begin + 1] == "Refractive refinement, static_interface"
+    # As if it had been named.
+    run(refiner(model, tmp_path / "named", "--refractive_index", "1.34"))
+    auto, named = (read_sidecar(tmp_path / name) for name in ("auto", "named"))
+    assert (auto.scenario, auto.options) == (named.scenario, named.options)
+    assert auto.images.keys() == named.images.keys()
+    for name, image in named.images.items():
+        assert auto.images[name].distance == pytest.approx(image.distance, rel=1e-6)
+    recorded = auto.statistics["comparison"]
+    assert recorded["chosen"] == "static_interface" and recorded["why"] == lines[begin - 2]
+    assert [trial["label"] for trial in recorded["trials"]][-1] == "moving_interface"
+    errors = {trial["label"]: trial["error"] for trial in recorded["trials"]}
+    assert errors.pop("camera_housing") is None
+    # Two coordinates of 0.5 px, and what the points are off.
+    assert len(errors) == 2 and all(0.5 < error < 1.5 for error in errors.values())
+    assert "comparison" not in named.statistics
+
+
+def test_scenario_auto_with_what_cannot_be(run: Run, model: Path, tmp_path: Path) -> None:
+    arguments = refiner(model, tmp_path / "out", "--reference_image", "nobody.jpg", scenario="auto")
+    assert run.fails(arguments).count("'nobody.jpg'") == 1
+    workspace = ["automatic_reconstructor", "--workspace_path", str(tmp_path / "new"), "--scenario", "auto"]
+    said = run.fails(workspace)
+    assert "--refine 0" in said and f"--scenario auto --input_path {tmp_path / 'new' / 'sparse' / '0'}" in said
+
+
 def test_overwrite(run: Run, model: Path, earlier: Path) -> None:
     (earlier / "points3D.txt").write_text("stale")
+    (earlier / "point_std.csv").write_text("of points that are there no more")
     (earlier / "notes.txt").write_text("of the user")
     run(refiner(model, earlier, "--overwrite", "1"))
     assert {p.name for p in earlier.iterdir()} == {*OUTPUT, "notes.txt"}
@@ -639,10 +677,23 @@ def test_progress_is_for_terminals(model: Path, tmp_path: Path) -> None:
     assert status == 0
     shown = run.shown.decode()
     assert re.search(r"iteration [0-9]+, error [0-9.]+ px", shown)
+    assert "Candidate" not in shown
     # One line, that is cleared in the end.
     assert "\n" not in shown
     assert shown.rstrip("\r").split("\r")[-1].strip() == ""
     assert "iteration 1," not in out
+
+
+def test_progress_says_which_candidate_is_tried(model: Path, tmp_path: Path) -> None:
+    run = OnTerminal(refiner(model, tmp_path / "out", scenario="auto"))
+    status, out = run.close()
+    assert status == 0
+    shown = run.shown.decode()
+    found = re.findall(r"Candidate ([0-9]) of 3, (?:static|moving|camera)_[a-z]+: [^\r]*iteration [0-9]+", shown)
+    assert {*found} == {"1", "2", "3"} and found == sorted(found)
+    assert "iteration" in shown.rpartition("Candidate 3 of 3")[2].partition("\r")[2]
+    # That is for the line of progress; what came of it is for all.
+    assert "Candidate 1" not in out and "unknowns" in out
 
 
 @pytest.fixture(scope="session")

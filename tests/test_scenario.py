@@ -88,7 +88,7 @@ cases = pytest.mark.parametrize(("scenario", "sensors", "groups"), CASES)
 def test_pose_map_is_the_derivative_of_the_poses(scenario: Scenario, sensors: int, groups: bool, size: float) -> None:
     structure, state = arrange(scenario, sensors=sensors, groups=groups)
     change = random_change(state, size)
-    views = evaluate_views(structure, state, change, np.zeros((structure.num_images, 4), np.int32))
+    views = evaluate_views(structure, state, change, np.zeros((structure.num_images, 5), np.int32))
 
     def pose(j: int, step: float) -> tuple[Array, Array]:
         moved = change.pose.copy()
@@ -109,7 +109,7 @@ def test_pose_map_is_the_derivative_of_the_poses(scenario: Scenario, sensors: in
 def test_plane_map_is_the_derivative_of_the_planes(scenario: Scenario, sensors: int, groups: bool, size: float) -> None:
     structure, state = arrange(scenario, sensors=sensors, groups=groups)
     change = random_change(state, size)
-    views = evaluate_views(structure, state, change, np.zeros((structure.num_images, 4), np.int32))
+    views = evaluate_views(structure, state, change, np.zeros((structure.num_images, 5), np.int32))
     wet = structure.image_plane >= 0
 
     def plane(j: int, step: float) -> Array:
@@ -200,7 +200,7 @@ def test_without_any_interface_there_are_no_planes() -> None:
         structure, image_plane=np.full(4, -1), plane_in_world=np.zeros(0, bool), plane_anchor=np.zeros((0, 3))
     )
     state = replace(state, normal=np.zeros((0, 3)), distance=np.zeros(0))
-    views = evaluate_views(structure, state, Change.zero(state), np.full((4, 4), -1, np.int32))
+    views = evaluate_views(structure, state, Change.zero(state), np.full((4, 5), -1, np.int32))
     assert np.isnan(state.planes_in_cam(structure)[0]).all()
     assert np.isfinite(views.normal).all() and (views.distance > 0).all() and not views.in_world.any()
 

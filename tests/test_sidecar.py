@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from functools import partial
@@ -15,7 +16,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from colmap_refract.files.sidecar import ImageInterface, Sidecar, WorldPlane, read_sidecar, write_sidecar
-from colmap_refract.interface import Layers
+from colmap_refract.interface import Layers, tangent_basis
+from colmap_refract.water_surface import WaterSurface
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
 positive = st.floats(min_value=5e-324, allow_infinity=False, allow_nan=False)
@@ -31,7 +33,28 @@ def units(draw: st.DrawFn) -> tuple[float, float, float]:
     return float(unit[0]), float(unit[1]), float(unit[2])
 
 
-wet = st.builds(
+@st.composite
+def surfaces_over(draw: st.DrawFn, normal: tuple[float, float, float]) -> WaterSurface:
+    nx, ny = draw(st.integers(1, 4)), draw(st.integers(1, 3))
+    x, y = (np.sort(draw(st.lists(finite, min_size=n, max_size=n, unique=True))) for n in (nx, ny))
+    return WaterSurface(
+        axes=tangent_basis(np.array(normal)),
+        x=x + 0.0,  # 0.0 and -0.0 are not unique
+        y=y + 0.0,
+        heights=np.array(draw(st.lists(finite, min_size=nx * ny, max_size=nx * ny))).reshape(ny, nx),
+        correlation_length=draw(positive),
+        slope_deviation=draw(st.none() | st.floats(0, 1e300)),
+    )
+
+
+@st.composite
+def planes_and_surfaces(draw: st.DrawFn) -> ImageInterface:
+    plain = draw(planes)
+    assert plain.normal_in_cam is not None
+    return dataclasses.replace(plain, surface=draw(surfaces_over(plain.normal_in_cam)))
+
+
+planes = st.builds(
     ImageInterface,
     image_id=st.integers(0, 2**32 - 2),
     normal_in_cam=units(),
@@ -40,6 +63,7 @@ wet = st.builds(
     normal_std_deg=st.none() | finite,
     distance_std=st.none() | finite,
 )
+wet = planes | planes_and_surfaces()
 dry = st.builds(ImageInterface, image_id=st.integers(0, 2**32 - 2))
 layers = st.integers(0, 3).flatmap(
     lambda n: st.builds(
@@ -178,7 +202,7 @@ def test_other_json(file: Path, content: bytes) -> None:
 
 
 def test_versions(file: Path) -> None:
-    message = error_of(lambda: read_sidecar(edited(file, "version", value=2)))
+    message = error_of(lambda: read_sidecar(edited(file, "version", value=3)))
     assert "newer" in message and "update colmap_refract" in message
     for version in (0, -1, "1", 1.5, True, None):
         assert "not a format version" in error_of(partial(read_sidecar, edited(file, "version", value=version)))
@@ -245,6 +269,86 @@ WET = ("images", "dive 1/プール.png")
 def test_impossible_values(file: Path, keys: tuple[Any, ...], value: Any, expected: str) -> None:
     message = error_of(lambda: read_sidecar(edited(file, *keys, value=value)))
     assert message.startswith(f'{file}: "{keys[0]}"') and expected in message
+
+
+SURFACE = WaterSurface(
+    axes=np.array([[1.0, 0.0], [0.0, 0.8], [0.0, -0.6]]),
+    x=np.array([0.1, 0.2, 0.4]),
+    y=np.array([-1.0, 1.0]),
+    heights=np.array([[0.01, 1 / 3, -0.02], [0.0, 1e-300, -0.5]]),
+    correlation_length=0.7,
+    slope_deviation=0.05,
+)
+
+
+@pytest.fixture
+def wavy(tmp_path: Path) -> Path:
+    sidecar, name = example(), WET[1]
+    images = {**sidecar.images, name: dataclasses.replace(sidecar.images[name], surface=SURFACE)}
+    path = tmp_path / "refraction.json"
+    write_sidecar(dataclasses.replace(sidecar, images=images), path)
+    return path
+
+
+def test_format_of_a_surface(wavy: Path) -> None:
+    root = json.loads(wavy.read_text(encoding="utf-8"))
+    assert root["version"] == 2, "a reader of version 1 would take it for a plane"
+    assert root["images"][WET[1]]["surface"] == {
+        "axes": [[1.0, 0.0], [0.0, 0.8], [0.0, -0.6]],
+        "x": [0.1, 0.2, 0.4],
+        "y": [-1.0, 1.0],
+        "heights": [[0.01, 1 / 3, -0.02], [0.0, 1e-300, -0.5]],
+        "correlation_length": 0.7,
+        "slope_deviation": 0.05,
+    }
+    assert "surface" not in root["images"]["dry.png"]
+    surface = read_sidecar(wavy).images[WET[1]].surface
+    assert surface == SURFACE
+    edited(wavy, *WET, "surface", "slope_deviation", remove=True)
+    assert read_sidecar(wavy).images[WET[1]].surface == dataclasses.replace(SURFACE, slope_deviation=None)
+
+
+def test_flat_ones_are_what_they_were(file: Path) -> None:
+    """Readers of version 1 read them, and what such a writer wrote is read."""
+    root = json.loads(file.read_text(encoding="utf-8"))
+    assert root["version"] == 1
+    assert all("surface" not in image for image in root["images"].values())
+    edited(file, "version", value=2)
+    assert read_sidecar(file) == example()
+
+
+@pytest.mark.parametrize(
+    ("keys", "value", "expected"),
+    [
+        ((), 3, "not a JSON object"),
+        (("axes",), [[1, 0], [0, 1]], "not two orthonormal"),
+        (("axes",), [[1, 0], [0, 1], [0]], "equally long"),
+        (("axes",), [[1, 0], [0, 0.6], [0, 0.8]], "do not lie along its plane"),
+        (("x",), [0.1, 0.4, 0.2], "increasing"),
+        (("x",), [0.1, 0.2], "shape (2, 3), its nodes (2, 2)"),
+        (("x",), 1, "not a list"),
+        (("y", 0), "a", "not a finite number"),
+        (("heights",), [], "equally long"),
+        (("heights", 0), [], "equally long"),
+        (("heights", 0, 1), None, "not a finite number"),
+        (("correlation_length",), 0, "not positive"),
+        (("slope_deviation",), -0.1, "negative"),
+    ],
+)
+def test_impossible_surfaces(wavy: Path, keys: tuple[Any, ...], value: Any, expected: str) -> None:
+    message = error_of(lambda: read_sidecar(edited(wavy, *WET, "surface", *keys, value=value)))
+    assert message.startswith(f'{wavy}: "images"') and expected in message
+
+
+def test_surface_without_a_plane(wavy: Path) -> None:
+    for key in ("normal_in_cam", "distance"):
+        edited(wavy, *WET, key, value=None)
+    assert "without its plane" in error_of(lambda: read_sidecar(wavy))
+
+
+@pytest.mark.parametrize("key", ["axes", "x", "y", "heights", "correlation_length"])
+def test_incomplete_surfaces(wavy: Path, key: str) -> None:
+    assert f'"{key}" is missing' in error_of(lambda: read_sidecar(edited(wavy, *WET, "surface", key, remove=True)))
 
 
 def test_infinite_literal(file: Path) -> None:

@@ -10,7 +10,8 @@ import tyro
 
 from colmap_refract.commands.lists import read_groups, read_names
 from colmap_refract.commands.progress import ProgressLine
-from colmap_refract.options import ImageNotes, RefinerOptions
+from colmap_refract.errors import RefractError
+from colmap_refract.options import ImageNotes, RefinerRequest
 from colmap_refract.reconstructor.options import ReconstructorOptions
 from colmap_refract.reconstructor.watcher import Watcher
 
@@ -31,7 +32,7 @@ class AutomaticReconstructor:
     workspace_path: Path
     """Folder to work in; made if it does not exist."""
     options: Annotated[ReconstructorOptions, tyro.conf.arg(name="")]
-    refiner: Annotated[RefinerOptions, tyro.conf.arg(name="")]
+    refiner: Annotated[RefinerRequest, tyro.conf.arg(name="")]
     image_path: Path | None = None
     """Folder of the photographs. By default `images` in the workspace."""
     database_path: Path | None = None
@@ -48,6 +49,12 @@ class AutomaticReconstructor:
         from colmap_refract.reconstructor.pipeline import reconstruct
         from colmap_refract.refiner.report import report
 
+        if self.refiner.scenario == "auto":
+            # Images of a camera that stands still are mapped in another way, so the mapping would have to wait for it.
+            raise RefractError(
+                "automatic_reconstructor takes no scenario auto: name it; or map with --scenario moving_interface "
+                f"--refine 0, then choose with refiner --scenario auto --input_path {self.workspace_path / 'sparse/0'}"
+            )
         notes = ImageNotes(
             interface_groups=read_groups(self.interface_group_path),
             dry_images=frozenset(read_names(self.dry_image_list_path)),
@@ -57,7 +64,7 @@ class AutomaticReconstructor:
                 result = reconstruct(
                     self.workspace_path,
                     self.options,
-                    self.refiner,
+                    self.refiner.with_scenario(self.refiner.scenario),
                     image_path=self.image_path,
                     database_path=self.database_path,
                     camera_path=self.camera_path,
@@ -92,9 +99,7 @@ class _Terminal(Watcher):
         self._line.show(stage, progress)
 
     def report(self, label: str, text: str) -> None:
-        self._line.say("")
-        self._line.say("")
-        print(f"{label + ':':18s}{text}", flush=True)
+        self._line.print(f"{label + ':':18s}{text}")
 
     def warn(self, line: str) -> None:
         self.report("WARNING", line)

@@ -37,6 +37,12 @@ class ProgressLine:
         """What is being done, in a few words."""
         self._write(text)
 
+    def print(self, text: str) -> None:
+        """Lines for standard output, below which the line goes on."""
+        self.say("")
+        self.say("")
+        print(text, flush=True)
+
     def _write(self, text: str) -> None:
         if self._shown:
             sys.stderr.write("\r" + text[:118].ljust(self._length))

@@ -10,7 +10,7 @@ import tyro
 
 from colmap_refract.commands.lists import read_groups, read_names
 from colmap_refract.commands.progress import ProgressLine
-from colmap_refract.options import ImageNotes, RefinerOptions
+from colmap_refract.options import ImageNotes, RefinerRequest
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +24,7 @@ class Refiner:
     """Folder of the COLMAP model, binary or text."""
     output_path: Path
     """Folder to write the refined model to."""
-    options: Annotated[RefinerOptions, tyro.conf.arg(name="")]
+    options: Annotated[RefinerRequest, tyro.conf.arg(name="")]
     camera_path: Path | None = None
     """COLMAP cameras file (.bin or .txt) with intrinsics calibrated in air, in place of the model's."""
     interface_group_path: Path | None = None
@@ -44,7 +44,9 @@ class Refiner:
         from colmap_refract.files.model_io import read_model, write_model
         from colmap_refract.files.output import output_folder
         from colmap_refract.files.sidecar import SIDECAR_NAME, write_sidecar
+        from colmap_refract.refiner.comparison import table
         from colmap_refract.refiner.report import report
+        from colmap_refract.refiner.scenario_choice import choose_scenario
 
         with output_folder(self.output_path, input_path=self.input_path, overwrite=self.overwrite) as folder:
             model = read_model(self.input_path)
@@ -53,19 +55,28 @@ class Refiner:
                 interface_groups=read_groups(self.interface_group_path),
                 dry_images=frozenset(read_names(self.dry_image_list_path)),
             )
+            comparison = None
             with ProgressLine() as line:
+                if self.options.scenario == "auto":
+                    comparison = choose_scenario(model, self.options, notes=notes, cameras=cameras, watch=line.show)
+                    line.print(f"{table(comparison)}\n")
+                    options = comparison.chosen.options
+                else:
+                    options = self.options.with_scenario(self.options.scenario)
                 if self.database_path is None:
                     from colmap_refract.refiner.refinement import refine
 
-                    result = refine(model, self.options, notes=notes, cameras=cameras, watch=line.show)
+                    result = refine(model, options, notes=notes, cameras=cameras, watch=line.show)
                 else:
                     from colmap_refract.mapping.database import read_correspondences
                     from colmap_refract.mapping.retriangulation import refine_with_database
 
                     matches = read_correspondences(self.database_path, verified=False)
                     result = refine_with_database(
-                        model, self.options, matches, notes=notes, cameras=cameras, watch=line.show
+                        model, options, matches, notes=notes, cameras=cameras, watch=line.show
                     )
+            if comparison is not None:
+                result.sidecar.statistics["comparison"] = comparison.as_dict()
             write_model(result.reconstruction, folder)
             write_sidecar(result.sidecar, folder / SIDECAR_NAME)
         print(report(result.sidecar))

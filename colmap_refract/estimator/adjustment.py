@@ -21,6 +21,7 @@ from threadpoolctl import threadpool_limits
 
 from colmap_refract.estimator.chunk import Chunk, Problem, change_of, slot_width, split
 from colmap_refract.estimator.elimination import PLANE, POSE, Anchors
+from colmap_refract.estimator.priors import PriorBlock, prior_blocks
 from colmap_refract.estimator.scenario import State, apply
 from colmap_refract.interface import Array
 
@@ -166,12 +167,38 @@ class _ReducedCost(pyceres.CostFunction):  # type: ignore[misc]
         return True
 
 
+class _PriorCost(pyceres.CostFunction):  # type: ignore[misc]
+    """A prior as Ceres sees it."""
+
+    def __init__(self, block: PriorBlock, watch: _Watch) -> None:
+        super().__init__()
+        self.block = block
+        self.watch = watch
+        self.set_num_residuals(block.num_residuals)
+        self.set_parameter_block_sizes([slot_width(slot, watch.state) for slot, _ in block.keys])
+
+    def Evaluate(self, parameters: list[Array], residuals: Array, jacobians: list[Array | None] | None) -> bool:
+        if self.watch.exception is not None:
+            return False
+        try:
+            values, by_blocks = self.block.evaluate(parameters)
+        except BaseException as exception:
+            self.watch.exception = exception
+            return False
+        residuals[:] = values
+        for jacobian, by_block in zip(jacobians or [], by_blocks, strict=False):
+            if jacobian is not None:
+                jacobian[:] = by_block.ravel()
+        return bool(np.isfinite(values).all())
+
+
 @dataclass
 class _Watch:
     """What happens during a solve: the exception to raise afterwards, and the last gradient."""
 
     on_progress: Callable[[Progress], None] | None
     num_observations: int
+    state: State
     exception: BaseException | None = None
     gradient_max_norm: float = float("nan")
 
@@ -233,13 +260,14 @@ def adjust(
     if anchor_weights is not None:
         for chunk in chunks:
             chunk.anchors = Anchors(anchor_weights[chunk.point_indices], chunk.points.copy())
-    keys = sorted({key for chunk in chunks for key in chunk.keys})
+    priors = prior_blocks(problem)
+    keys = sorted({key for chunk in chunks for key in chunk.keys} | {key for prior in priors for key in prior.keys})
     blocks = _Blocks(keys, {key: np.zeros(slot_width(key[0], problem.state)) for key in keys})
-    watch = _Watch(on_progress, len(problem.tracks.image))
+    watch = _Watch(on_progress, len(problem.tracks.image), problem.state)
     num_slices = max((len(chunk.slices) for chunk in chunks), default=1)
     pool = ThreadPoolExecutor(num_slices) if num_slices > 1 else None
     try:
-        return _solve(problem, settings, chunks, blocks, watch, pool, plane_deviations)
+        return _solve(problem, settings, chunks, priors, blocks, watch, pool, plane_deviations)
     finally:
         if pool is not None:
             pool.shutdown()
@@ -249,6 +277,7 @@ def _solve(
     problem: Problem,
     settings: SolverSettings,
     chunks: list[Chunk],
+    priors: list[PriorBlock],
     blocks: _Blocks,
     watch: _Watch,
     pool: ThreadPoolExecutor | None,
@@ -273,6 +302,8 @@ def _solve(
             None,
             [blocks.values[POSE, problem.pinned_pose]],
         )
+    for prior in priors:
+        ceres.add_residual_block(_PriorCost(prior, watch), None, [blocks.values[key] for key in prior.keys])
     for key in blocks.keys:
         if key[0] != PLANE:
             continue
@@ -349,5 +380,7 @@ def settle_points(problem: Problem, settings: SolverSettings) -> Array:
         distances=np.ones_like(problem.held.distances),
         index=True,
         lens=True,
+        waves=True,
     )
-    return adjust(replace(problem, held=held), settings).points
+    free_of_priors = replace(problem, held=held, wave_prior=None, level_prior=None)
+    return adjust(free_of_priors, settings).points

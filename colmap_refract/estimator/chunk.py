@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_refract.estimator import elimination
-from colmap_refract.estimator.elimination import LENS, MEDIUM, PLANE, POSE, Anchors, Optics, Tracks
+from colmap_refract.estimator.elimination import LENS, MEDIUM, PLANE, POSE, WAVES, Anchors, Optics, Tracks
 from colmap_refract.estimator.optics import Media
 from colmap_refract.estimator.scenario import Change, State, Structure, evaluate_views
 from colmap_refract.interface import Array, Layers
@@ -32,6 +32,9 @@ MAX_CHUNK_COLUMNS = 700
 """Up to this many unknowns all tracks form one chunk; beyond, Ceres' product of the Jacobian with itself,
 cubic in a chunk's unknowns, is worth splitting for."""
 
+_WORTH = 0.9
+"""Part of a chunk's unknowns that a half of it may still touch for the split to be made."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Held:
@@ -40,7 +43,7 @@ class Held:
     Attributes:
         poses: (F,) pose blocks.
         normals, distances: (B,) of the plane blocks.
-        points, index, lens: all of them.
+        points, index, lens, waves: all of them.
     """
 
     poses: NDArray[np.bool_]
@@ -49,6 +52,7 @@ class Held:
     points: bool = False
     index: bool = True
     lens: bool = True
+    waves: bool = False
 
     @staticmethod
     def nothing(state: State) -> Held:
@@ -58,6 +62,29 @@ class Held:
             normals=np.zeros(planes, bool),
             distances=np.zeros(planes, bool),
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class LevelPrior:
+    """The planes of a moving interface scatter about one plane of the world.
+
+    The common plane is unknown itself, and stands wherever the others draw it. A plane's height is compared where
+    its own camera stands, so that a tilt far from the origin is no height.
+
+    Attributes:
+        tilt: standard deviation of the slope in each of two directions, radians.
+        lift: standard deviation of the height, over the distance of the cameras from the common plane.
+        noise: of a keypoint coordinate, px: what a deviation of one standard deviation is worth.
+    """
+
+    tilt: float
+    lift: float
+    noise: float
+
+    @property
+    def weights(self) -> Array:
+        """(4,) px per radian and per relative height, of the residuals that `compare_to_level` gives."""
+        return self.noise / np.array([self.tilt, self.tilt, self.tilt, self.lift])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +102,17 @@ class Problem:
     pinned_pose: int | None = None
     """Pose block whose distance from the origin stays, so that the size does, which a wall's thickness would
     otherwise tell, and badly."""
+    wave_prior: Array | None = None
+    """(I, M, K) in px: half the squared length of `wave_prior[i] @ waves[i]` is added to the cost."""
+    level_prior: LevelPrior | None = None
+    on_rays: bool = False
+    """Each point lies on the refracted ray of its first observation, exactly, which has no residual of its own: a
+    reference image's (see `reference_rays`). Not for known points."""
+
+    @property
+    def num_waves(self) -> int:
+        """Wave coefficients per image; 0 where all surfaces are flat."""
+        return int(self.state.waves.shape[1])
 
     @property
     def optics(self) -> Optics:
@@ -88,7 +126,7 @@ def _optics(layers: Layers, index: float) -> Optics:
 
 
 def slot_width(slot: int, state: State) -> int:
-    return (6, 3, 1, state.lens.shape[1])[slot]
+    return (6, 3, 1, state.lens.shape[1], state.waves.shape[1], 3)[slot]
 
 
 def _image_blocks(problem: Problem, image: int) -> list[tuple[int, int]]:
@@ -104,6 +142,8 @@ def _image_blocks(problem: Problem, image: int) -> list[tuple[int, int]]:
         blocks.append((MEDIUM, 0))
     if not held.lens:
         blocks.append((LENS, int(structure.image_camera[image])))
+    if plane >= 0 and problem.state.waves.shape[1] and not held.waves:
+        blocks.append((WAVES, image))
     return blocks
 
 
@@ -123,8 +163,10 @@ def change_of(state: State, values: Iterable[tuple[tuple[int, int], Array]]) -> 
             change.plane[block] = value
         elif slot == MEDIUM:
             index = float(value[0])
-        else:
+        elif slot == LENS:
             change.lens[block] = value
+        elif slot == WAVES:
+            change.waves[block] = value
     return replace(change, index=index)
 
 
@@ -138,14 +180,8 @@ class Chunk:
         take = np.arange(start[-1]) + np.repeat(tracks.start[point_indices] - start[:-1], lengths)
         images = np.unique(tracks.image[take]).astype(np.int64)
         self.point_indices = point_indices
-        self.tracks = Tracks(
-            start=start,
-            image=_local(tracks.image[take].astype(np.int64), images).astype(np.int32),
-            direction=np.ascontiguousarray(tracks.direction[take]),
-            metric=np.ascontiguousarray(tracks.metric[take]),
-            lens=np.ascontiguousarray(tracks.lens[take]),
-            wet=tracks.wet[take],
-        )
+        mine = tracks.take(start, take)
+        self.tracks = mine._replace(image=_local(mine.image.astype(np.int64), images).astype(np.int32))
         poses = np.unique(structure.image_pose[images])
         planes = np.unique(structure.image_plane[images])
         planes = planes[planes >= 0]
@@ -158,6 +194,7 @@ class Chunk:
             sensor_translation=structure.sensor_translation[images],
             plane_in_world=structure.plane_in_world[planes],
             plane_anchor=structure.plane_anchor[planes],
+            wave_axes=structure.wave_axes[images] if len(structure.wave_axes) else structure.wave_axes,
         )
         state = problem.state
         self.state = State(
@@ -167,16 +204,17 @@ class Chunk:
             distance=state.distance[planes],
             index=state.index,
             lens=state.lens[cameras],
+            waves=state.waves[images] if problem.num_waves else state.waves,
         )
         self.keys: list[tuple[int, int]] = sorted({key for i in images for key in _image_blocks(problem, int(i))})
         self.widths = [slot_width(slot, state) for slot, _ in self.keys]
         self.first_column = dict(zip(self.keys, np.concatenate([[0], np.cumsum(self.widths)]).tolist(), strict=False))
         self.num_columns = int(sum(self.widths))
-        self.columns = np.full((len(images), 4), -1, dtype=np.int32)
+        self.columns = np.full((len(images), 5), -1, dtype=np.int32)
         for row, image in enumerate(images):
             for key in _image_blocks(problem, int(image)):
                 self.columns[row, key[0]] = self.first_column[key]
-        self._place = {POSE: poses, PLANE: planes, MEDIUM: np.zeros(1, np.int64), LENS: cameras}
+        self._place = {POSE: poses, PLANE: planes, MEDIUM: np.zeros(1, np.int64), LENS: cameras, WAVES: images}
         self._problem = problem
         self._loss = (_LOSSES[problem.loss], problem.loss_scale)
         self.points = np.ascontiguousarray(problem.points[point_indices])
@@ -192,7 +230,7 @@ class Chunk:
         """The images at Ceres' parameter values; None where a plane would lie behind its camera."""
         places = ((slot, int(np.searchsorted(self._place[slot], block))) for slot, block in self.keys)
         change = change_of(self.state, zip(places, parameters, strict=True))
-        if not all(np.isfinite(a).all() for a in (change.pose, change.plane, change.lens)):
+        if not all(np.isfinite(a).all() for a in (change.pose, change.plane, change.lens, change.waves)):
             return None
         views = evaluate_views(self.structure, self.state, change, self.columns)
         if not (views.distance > 0.0).all() or self.state.index + change.index <= 0.0:
@@ -224,7 +262,7 @@ class Chunk:
                 self._run(
                     pool,
                     lambda _, a, b: elimination.settle(
-                        points, self.anchors, a, b, self.tracks, views, optics, *self._loss
+                        points, self.anchors, a, b, self.tracks, views, optics, *self._loss, self._problem.on_rays
                     ),
                 )
             )
@@ -248,7 +286,7 @@ class Chunk:
             pool,
             lambda k, a, b: elimination.reduce(
                 self.points, self._problem.held.points, self.anchors, a, b, self.tracks, views, optics,
-                *self._loss, matrices[k], gradients[k],
+                *self._loss, matrices[k], gradients[k], self._problem.on_rays,
             ),
         )  # fmt: skip
         for matrix, gradient in zip(matrices[1:], gradients[1:], strict=True):
@@ -267,6 +305,13 @@ def robust_cost(squared: Array, loss: Loss, scale: float) -> Array:
     if loss == "cauchy":
         return np.asarray(b * np.log1p(squared / b))
     return squared
+
+
+def _touched(tracks: Tracks, lengths: NDArray[np.int64], part: NDArray[np.int64]) -> NDArray[np.int32]:
+    """The images that see some of the points `part`."""
+    rows = np.repeat(tracks.start[part], lengths[part])
+    offsets = np.arange(len(rows)) - np.repeat(np.cumsum(lengths[part]) - lengths[part], lengths[part])
+    return np.unique(tracks.image[rows + offsets])
 
 
 def split(problem: Problem, num_threads: int) -> list[Chunk]:
@@ -290,14 +335,15 @@ def split(problem: Problem, num_threads: int) -> list[Chunk]:
     while pending:
         part = pending.pop()
         if total > MAX_CHUNK_COLUMNS and len(part) > 200:
-            rows = np.repeat(tracks.start[part], lengths[part])
-            offsets = np.arange(len(rows)) - np.repeat(np.cumsum(lengths[part]) - lengths[part], lengths[part])
-            touched = np.unique(tracks.image[rows + offsets])
+            touched = _touched(tracks, lengths, part)
             spread = np.ptp(observer[part], axis=0)
             if own[touched].sum() > MAX_CHUNK_COLUMNS / 2 and spread.max() > 0:
                 order = np.argsort(observer[part, int(spread.argmax())], kind="stable")
-                pending += [part[order[: len(part) // 2]], part[order[len(part) // 2 :]]]
-                continue
+                halves = [part[order[: len(part) // 2]], part[order[len(part) // 2 :]]]
+                # Where every image sees everything, halves would touch as many unknowns as the whole.
+                if min(own[_touched(tracks, lengths, half)].sum() for half in halves) < _WORTH * own[touched].sum():
+                    pending += halves
+                    continue
         parts.append(np.sort(part))
     num_slices = num_threads if len(parts) < num_threads else 1
     return [Chunk(problem, part, num_slices) for part in parts]

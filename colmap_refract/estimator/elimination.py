@@ -5,25 +5,51 @@ For given cameras and planes each point is brought to its own minimum and remove
 is left is the cost `f`, gradient `g` and Gauss-Newton matrix `H` in the camera-side parameters only.
 
 The kernel knows no scenario and no camera model. An observation is a direction with a pixel metric, and
-depends on the point and on up to four *slots* of its image: the pose (6), the plane (3), the index of the
-medium (1) and the lens (any number). `image_columns` says where each slot's parameters stand in the
-chunk's vector (-1: held), so a scenario is only a choice of who shares which columns (module `scenario`).
+depends on the point and on up to five *slots* of its image: the pose (6), the plane (3), the index of the
+medium (1), the lens and the waves on the surface (any number each). `Views.columns` says where each slot's
+parameters stand in the chunk's vector (-1: held), so a scenario is only a choice of who shares which columns
+(module `scenario`).
+
+Waves: an observation is refracted by a plane of its own, the tangent of the surface where the keypoint's ray
+meets it (the paper's `n_ij`). Height and slopes there are linear in the image's coefficients, so the same
+derivatives by a plane serve, and the keypoint decides where the ray crosses: many paths to one point do no harm.
+
+A reference image: each point can be bound to the refracted ray of its first observation (the paper's `d_j`, `on_rays`),
+and residuals can be distances in the scene rather than in the image (the paper's `D_ij`, `Tracks.scene`).
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from colmap_refract.estimator.observed import (
+    BY_DISTANCE,
+    BY_HEIGHT,
+    BY_INDEX,
+    BY_NORMAL,
+    BY_POINT,
+    BY_SLOPE,
+    IN_CAM,
+    RESIDUAL,
+    VALUES,
+    from_local_plane,
+    local_plane,
+)
+from colmap_refract.estimator.on_ray import eliminate_length, refracted_ray
 from colmap_refract.estimator.optics import FAST, one_interface, slope_derivatives, snell_root
+from colmap_refract.estimator.scene_residual import observe_in_scene
 from colmap_refract.interface import Array
 
-POSE, PLANE, MEDIUM, LENS = range(4)
+POSE, PLANE, MEDIUM, LENS, WAVES = range(5)
 """The slots of an image."""
+
+LEVEL = 5
+"""The plane that all planes of a moving interface scatter about: no observation looks at it, but a prior does."""
 
 TRIVIAL, HUBER, SOFT_L1, CAUCHY = range(4)
 """The robust losses."""
@@ -35,6 +61,9 @@ scale of a robust loss many."""
 POINT_TOLERANCE = 1e-7
 """A point is at its minimum when one more step would lower its cost by less than this fraction.
 What such a step would gain is subtracted from the cost, so the error left is of the next order."""
+
+_LENGTH_TOLERANCE = 1e-12
+"""Relative, of a length along a ray; for residuals so small that no tolerance in pixels serves."""
 
 _SQUARED_PIXEL_FLOOR = 1e-14
 _GUARD = 1e-11
@@ -50,6 +79,12 @@ class Tracks(NamedTuple):
         metric: (N, 2, 3) pixels per change of direction, at the keypoint.
         lens: (N, 2, Q) pixels per change of the camera's refined intrinsics; Q may be 0.
         wet: (N,) whether the point lies in the water as seen from this image.
+        waves: (N, 3, K) what the K wave coefficients of the image do where the keypoint's ray meets the surface: its
+            height over the plane's distance, towards the water, and the two parts of the normal along `Views.axes`.
+            K = 0, whatever N, where all surfaces are flat.
+        scene: (N, 3, 3) world frame. With two rows of weights, residuals are these times the difference between the
+            point and the observation's ray at the same depth along the third row, a unit vector; see
+            `scene_residual`. (0, 3, 3): residuals are in the image.
     """
 
     start: NDArray[np.int64]
@@ -58,6 +93,16 @@ class Tracks(NamedTuple):
     metric: Array
     lens: Array
     wet: NDArray[np.bool_]
+    waves: Array = np.zeros((0, 3, 0))
+    sight: Array = np.zeros((0, 3))
+    effects: Array = np.zeros((0, 2, 0))
+    offset: Array = np.zeros((0, 2))
+    scene: Array = np.zeros((0, 3, 3))
+
+    def take(self, start: NDArray[np.int64], rows: NDArray[Any]) -> Tracks:
+        """Some of the observations: `rows`, indices or a mask (N,), of points that begin at `start`."""
+        # What nobody needs is empty, whatever the number of observations.
+        return Tracks(start, *(part[rows] if part.shape[0] else part for part in self[1:]))
 
 
 class Views(NamedTuple):
@@ -71,7 +116,9 @@ class Views(NamedTuple):
             `rotation x x_cam + translation`.
         plane_map: (I, 4, 3) change of (`normal_in_cam`, `distance`) by the plane block at a fixed pose.
         lens_change: (I, Q) change of the refined intrinsics since the keypoints were lifted.
-        columns: (I, 4) first column of each slot in the chunk's parameter vector, -1 where it is held.
+        waves: (I, K) wave coefficients.
+        axes: (I, 3, 2) two directions along the plane, camera frame, that slopes are counted along.
+        columns: (I, 5) first column of each slot in the chunk's parameter vector, -1 where it is held.
     """
 
     rotation: Array
@@ -82,6 +129,8 @@ class Views(NamedTuple):
     pose_map: Array
     plane_map: Array
     lens_change: Array
+    waves: Array
+    axes: Array
     columns: NDArray[np.int32]
 
 
@@ -117,19 +166,9 @@ def _robust(s, loss, scale):
     return s, 1.0
 
 
-# Layout of one observation's values in scratch memory.
-_RESIDUAL = 0  # 2
-_BY_POINT = 2  # 2 x 3, by the point in the camera's frame
-_BY_NORMAL = 8  # 2 x 3, by a change of the normal orthogonal to it
-_BY_DISTANCE = 14  # 2
-_BY_INDEX = 16  # 2
-_IN_CAM = 18  # 3, the point in the camera's frame
-_VALUES = 21
-
-
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", inline="always")
 def _observe(k, point, tracks, views, optics, with_interface, out):
-    """Residual of observation `k` in pixels and its derivatives, into `out` (see the layout above).
+    """Residual of observation `k` in pixels and its derivatives, into `out` (layout of `observed`).
 
     The derivatives by the interface are left out unless `with_interface`.
     """
@@ -142,13 +181,17 @@ def _observe(k, point, tracks, views, optics, with_interface, out):
     vx, vy, vz = cx, cy, cz
     nx, ny, nz = views.normal[i, 0], views.normal[i, 1], views.normal[i, 2]
     px, py, pz = 0.0, 0.0, 0.0
+    d = views.distance[i]
+    waves = tracks.waves.shape[2] > 0
+    height, length, t, facing = 0.0, 1.0, 0.0, 1.0
+    if waves and tracks.wet[k]:
+        nx, ny, nz, d, height, length, t, facing = local_plane(k, i, tracks, views)
     z = nx * cx + ny * cy + nz * cz
     big, big_s, big_z, big_d, big_index = 1.0, 0.0, 0.0, 0.0, 0.0
     refracted = False
-    if tracks.wet[k] and z > 0.0:
+    if tracks.wet[k] and z > 0.0 and d > 0.0:
         px, py, pz = cx - z * nx, cy - z * ny, cz - z * nz
         s = px * px + py * py + pz * pz
-        d = views.distance[i]
         if optics.ratio.shape[0] == 2 and optics.ratio[1] < 1.0:
             big, big_s, big_z, big_d, big_index = one_interface(z, s, d, optics.ratio[1], optics.ratio_by_index[1])
         else:
@@ -169,11 +212,15 @@ def _observe(k, point, tracks, views, optics, with_interface, out):
         e = m0 * dx + m1 * dy + m2 * dz
         for q in range(tracks.lens.shape[2]):
             e += tracks.lens[k, row, q] * views.lens_change[i, q]
-        out[_RESIDUAL + row] = e
+        if tracks.effects.shape[2] > 0:
+            e += tracks.offset[k, row]
+            for q in range(tracks.effects.shape[2]):
+                e += tracks.effects[k, row, q] * views.waves[i, q]
+        out[RESIDUAL + row] = e
         # a = d residual / d v, through the normalisation of v.
         along = m0 * ux + m1 * uy + m2 * uz
         a0, a1, a2 = (m0 - along * ux) * inverse, (m1 - along * uy) * inverse, (m2 - along * uz) * inverse
-        by_point = _BY_POINT + 3 * row
+        by_point = BY_POINT + 3 * row
         if refracted:
             ap = a0 * px + a1 * py + a2 * pz
             an = a0 * nx + a1 * ny + a2 * nz
@@ -187,28 +234,36 @@ def _observe(k, point, tracks, views, optics, with_interface, out):
                 # by n: a (1 - G z) + ((a . p) (G_z - 2 z G_s) - G (a . n)) p
                 fa = 1.0 - big * z
                 fp = ap * (big_z - 2.0 * z * big_s) - big * an
-                by_normal = _BY_NORMAL + 3 * row
+                by_normal = BY_NORMAL + 3 * row
                 out[by_normal] = fa * a0 + fp * px
                 out[by_normal + 1] = fa * a1 + fp * py
                 out[by_normal + 2] = fa * a2 + fp * pz
-                out[_BY_DISTANCE + row] = ap * big_d
-                out[_BY_INDEX + row] = ap * big_index
+                out[BY_DISTANCE + row] = ap * big_d
+                out[BY_INDEX + row] = ap * big_index
+                if waves:
+                    b0, b1, b2, bd = out[by_normal], out[by_normal + 1], out[by_normal + 2], ap * big_d
+                    from_local_plane(
+                        row, k, i, tracks, views, b0, b1, b2, bd, nx, ny, nz, d, height, length, t, facing, out
+                    )  # fmt: skip
         else:
             out[by_point] = a0
             out[by_point + 1] = a1
             out[by_point + 2] = a2
             if with_interface:
                 for j in range(3):
-                    out[_BY_NORMAL + 3 * row + j] = 0.0
-                out[_BY_DISTANCE + row] = 0.0
-                out[_BY_INDEX + row] = 0.0
-    out[_IN_CAM], out[_IN_CAM + 1], out[_IN_CAM + 2] = cx, cy, cz
+                    out[BY_NORMAL + 3 * row + j] = 0.0
+                out[BY_DISTANCE + row] = 0.0
+                out[BY_INDEX + row] = 0.0
+                out[BY_HEIGHT + row] = 0.0
+                out[BY_SLOPE + 2 * row] = 0.0
+                out[BY_SLOPE + 2 * row + 1] = 0.0
+    out[IN_CAM], out[IN_CAM + 1], out[IN_CAM + 2] = cx, cy, cz
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", inline="always")
 def _by_world_point(row, rotation, i, values):
     """A row of the derivative by the point in the world, for image `i`."""
-    a0, a1, a2 = values[_BY_POINT + 3 * row], values[_BY_POINT + 3 * row + 1], values[_BY_POINT + 3 * row + 2]
+    a0, a1, a2 = values[BY_POINT + 3 * row], values[BY_POINT + 3 * row + 1], values[BY_POINT + 3 * row + 2]
     return (
         a0 * rotation[i, 0, 0] + a1 * rotation[i, 1, 0] + a2 * rotation[i, 2, 0],
         a0 * rotation[i, 0, 1] + a1 * rotation[i, 1, 1] + a2 * rotation[i, 2, 1],
@@ -220,19 +275,23 @@ def _by_world_point(row, rotation, i, values):
 def _point_system(point, anchor_weight, anchor, first, stop, tracks, views, optics, loss, scale, values, v, gradient):
     """Cost of one point, its gradient (3,) and its Gauss-Newton matrix `v` (xx, xy, xz, yy, yz, zz)."""
     cost = 0.0
+    in_scene = tracks.scene.shape[0] > 0
     for j in range(6):
         v[j] = 0.0
     for j in range(3):
         gradient[j] = 0.0
     for k in range(first, stop):
-        _observe(k, point, tracks, views, optics, False, values)
-        e0, e1 = values[_RESIDUAL], values[_RESIDUAL + 1]
+        if in_scene:
+            observe_in_scene(k, point, tracks, views, optics, False, values)
+        else:
+            _observe(k, point, tracks, views, optics, False, values)
+        e0, e1 = values[RESIDUAL], values[RESIDUAL + 1]
         rho, weight = _robust(e0 * e0 + e1 * e1, loss, scale)
         cost += 0.5 * rho
         i = tracks.image[k]
         for row in range(2):
             b0, b1, b2 = _by_world_point(row, views.rotation, i, values)
-            e = weight * values[_RESIDUAL + row]
+            e = weight * values[RESIDUAL + row]
             gradient[0] += e * b0
             gradient[1] += e * b1
             gradient[2] += e * b2
@@ -330,7 +389,46 @@ def _settle_point(point, anchor_weight, anchor, first, stop, tracks, views, opti
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def settle(points, anchors, first_track, stop_track, tracks, views, optics, loss, scale):
+def _settle_length(point, anchor_weight, anchor, first, stop, tracks, views, optics, loss, scale, scratch):
+    """`_settle_point` for a point on the ray of its first observation: first onto the ray, then along it."""
+    values, v, gradient = scratch[0], scratch[1], scratch[2]
+    origin, ray, trial = scratch[3], scratch[4], scratch[5]
+    refracted_ray(first, tracks, views, optics, origin, ray)
+    d = 0.0
+    for j in range(3):
+        d += (point[j] - origin[j]) * ray[j]
+    floor = _SQUARED_PIXEL_FLOOR * (stop - first)
+    cost, slope, curvature, damping, gain, step = 0.0, 0.0, 1.0, 0.0, 0.0, 0.0
+    for attempt in range(MAX_POINT_STEPS + 1):
+        for j in range(3):
+            trial[j] = origin[j] + (d - step) * ray[j]
+        trial_cost = _point_system(
+            trial, anchor_weight, anchor, first + 1, stop, tracks, views, optics, loss, scale, values, v, gradient
+        )  # fmt: skip
+        if attempt == 0 or trial_cost < cost:
+            d -= step
+            cost = trial_cost
+            damping *= 0.1 if damping > 1e-6 else 0.0
+            a0, a1, a2 = ray[0], ray[1], ray[2]
+            slope = a0 * gradient[0] + a1 * gradient[1] + a2 * gradient[2]
+            curvature = (
+                (a0 * (v[0] * a0 + 2.0 * (v[1] * a1 + v[2] * a2)) + a1 * (v[3] * a1 + 2.0 * v[4] * a2) + a2 * v[5] * a2)
+                + _GUARD * (v[0] + v[3] + v[5])
+                + 1e-300
+            )
+            gain = slope * slope / curvature
+        else:
+            damping = max(1e-3, 10.0 * damping)
+        step = slope / (curvature * (1.0 + damping))
+        if not (gain > POINT_TOLERANCE * cost + floor and abs(step) > _LENGTH_TOLERANCE * abs(d)):
+            break
+    for j in range(3):
+        point[j] = origin[j] + d * ray[j]
+    return cost - 0.5 * gain
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def settle(points, anchors, first_track, stop_track, tracks, views, optics, loss, scale, on_rays=False):
     """Bring points to their minima for the given views.
 
     Args:
@@ -339,31 +437,38 @@ def settle(points, anchors, first_track, stop_track, tracks, views, optics, loss
         first_track, stop_track: the range of points to work on.
         tracks, views, optics: see the tuples.
         loss, scale: robust loss and its scale in pixels.
+        on_rays: whether each point lies on the refracted ray of its first observation, which then has no residual.
 
     Returns:
         The summed cost at the minima.
     """
-    scratch = np.empty((7, _VALUES))
+    scratch = np.empty((7, VALUES))
     total = 0.0
     for p in range(first_track, stop_track):
-        total += _settle_point(
-            points[p], anchors.weight[p], anchors.position[p], tracks.start[p], tracks.start[p + 1],
-            tracks, views, optics, loss, scale, scratch,
-        )  # fmt: skip
+        if on_rays:
+            total += _settle_length(
+                points[p], anchors.weight[p], anchors.position[p], tracks.start[p], tracks.start[p + 1],
+                tracks, views, optics, loss, scale, scratch,
+            )  # fmt: skip
+        else:
+            total += _settle_point(
+                points[p], anchors.weight[p], anchors.position[p], tracks.start[p], tracks.start[p + 1],
+                tracks, views, optics, loss, scale, scratch,
+            )  # fmt: skip
     return total
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", inline="always")
 def _by_blocks(k, values, tracks, views, widths, out):
-    """The derivative of observation `k` by the blocks of its image, into `out` (4, 2, width)."""
+    """The derivative of observation `k` by the blocks of its image, into `out` (5, 2, width)."""
     i = tracks.image[k]
     pose_map, plane_map, columns = views.pose_map, views.plane_map, views.columns
     for row in range(2):
-        j0, j1, j2 = values[_BY_POINT + 3 * row], values[_BY_POINT + 3 * row + 1], values[_BY_POINT + 3 * row + 2]
-        n0, n1, n2 = values[_BY_NORMAL + 3 * row], values[_BY_NORMAL + 3 * row + 1], values[_BY_NORMAL + 3 * row + 2]
-        by_distance = values[_BY_DISTANCE + row]
+        j0, j1, j2 = values[BY_POINT + 3 * row], values[BY_POINT + 3 * row + 1], values[BY_POINT + 3 * row + 2]
+        n0, n1, n2 = values[BY_NORMAL + 3 * row], values[BY_NORMAL + 3 * row + 1], values[BY_NORMAL + 3 * row + 2]
+        by_distance = values[BY_DISTANCE + row]
         if columns[i, POSE] >= 0:
-            x, y, z = values[_IN_CAM], values[_IN_CAM + 1], values[_IN_CAM + 2]
+            x, y, z = values[IN_CAM], values[IN_CAM + 1], values[IN_CAM + 2]
             # Local rotation: x_cam changes by omega x x_cam; a plane fixed in the world moves along.
             r0, r1, r2 = y * j2 - z * j1, z * j0 - x * j2, x * j1 - y * j0
             t0, t1, t2 = j0, j1, j2
@@ -389,10 +494,30 @@ def _by_blocks(k, values, tracks, views, widths, out):
                     + by_distance * plane_map[i, 3, j]
                 )
         if columns[i, MEDIUM] >= 0:
-            out[MEDIUM, row, 0] = values[_BY_INDEX + row]
+            out[MEDIUM, row, 0] = values[BY_INDEX + row]
         if columns[i, LENS] >= 0:
             for j in range(widths[LENS]):
                 out[LENS, row, j] = tracks.lens[k, row, j]
+        if columns[i, WAVES] >= 0:
+            b0 = values[BY_HEIGHT + row]
+            b1, b2 = values[BY_SLOPE + 2 * row], values[BY_SLOPE + 2 * row + 1]
+            for j in range(tracks.effects.shape[2]):
+                out[WAVES, row, j] = tracks.effects[k, row, j]
+            for j in range(tracks.waves.shape[2]):
+                out[WAVES, row, j] = (
+                    b0 * tracks.waves[k, 0, j] + b1 * tracks.waves[k, 1, j] + b2 * tracks.waves[k, 2, j]
+                )
+
+
+# Not inlined: a second copy of `_observe` would slow `reduce` down and take long to compile.
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _constraint(k, point, tracks, views, optics, widths, values, by_point, by_blocks):
+    """Derivatives of observation `k`, that its point is bound to, by the point (2, 3) and by blocks (5, 2, width)."""
+    _observe(k, point, tracks, views, optics, True, values)
+    for row in range(2):
+        b0, b1, b2 = _by_world_point(row, views.rotation, tracks.image[k], values)
+        by_point[row, 0], by_point[row, 1], by_point[row, 2] = b0, b1, b2
+    _by_blocks(k, values, tracks, views, widths, by_blocks)
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", inline="always")
@@ -475,7 +600,10 @@ def _add_outer(matrix, row, column, weight, by_blocks, a, b, height, width):
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def reduce(points, hold_points, anchors, first_track, stop_track, tracks, views, optics, loss, scale, matrix, gradient):
+def reduce(
+    points, hold_points, anchors, first_track, stop_track, tracks, views, optics, loss, scale, matrix, gradient,
+    on_rays=False,
+):  # fmt: skip
     """Add the reduced system of settled points to `matrix` and `gradient`.
 
     Args:
@@ -487,26 +615,30 @@ def reduce(points, hold_points, anchors, first_track, stop_track, tracks, views,
         loss, scale: robust loss and its scale in pixels.
         matrix: (n, n), the upper triangle is added to (blocks on the diagonal are filled).
         gradient: (n,).
+        on_rays: as for `settle`; not for points that are known.
 
     Returns:
         The summed cost.
     """
-    num_lens = tracks.lens.shape[2]
-    widths = (6, 3, 1, num_lens)
-    most = max(6, num_lens)
+    num_lens, num_waves = tracks.lens.shape[2], max(tracks.waves.shape[2], tracks.effects.shape[2])
+    widths = (6, 3, 1, num_lens, num_waves)
+    most = max(6, num_lens, num_waves)
     longest = 1
     for p in range(first_track, stop_track):
         longest = max(longest, tracks.start[p + 1] - tracks.start[p])
-    values = np.empty(_VALUES)
-    by_blocks = np.empty((4, 2, most))
+    values = np.empty(VALUES)
+    by_blocks = np.empty((5, 2, most))
     v = np.empty(6)
     point_gradient = np.empty(3)
     lower = np.empty(6)
     # The blocks that the current point touches, and where a column's block stands among them.
-    touched_column = np.empty(4 * longest, dtype=np.int64)
-    touched_width = np.empty(4 * longest, dtype=np.int64)
-    coupling = np.empty((4 * longest, 3, most))
+    touched_column = np.empty(5 * longest, dtype=np.int64)
+    touched_width = np.empty(5 * longest, dtype=np.int64)
+    coupling = np.empty((5 * longest, 3, most))
     place = np.full(gradient.shape[0], -1, dtype=np.int64)
+    in_scene = tracks.scene.shape[0] > 0
+    origin, ray, by_point = np.empty(3), np.empty(3), np.empty((2, 3))
+    place_of_slot, shift = np.empty(5, dtype=np.int64), np.empty((5, 3, most))
     total = 0.0
     for p in range(first_track, stop_track):
         first, stop = tracks.start[p], tracks.start[p + 1]
@@ -517,8 +649,14 @@ def reduce(points, hold_points, anchors, first_track, stop_track, tracks, views,
         num_touched = 0
         for k in range(first, stop):
             i = tracks.image[k]
-            _observe(k, points[p], tracks, views, optics, True, values)
-            e0, e1 = values[_RESIDUAL], values[_RESIDUAL + 1]
+            # The observation that a point is bound to is a constraint, not an error: seen to after the others.
+            if on_rays and k == first:
+                continue
+            if in_scene:
+                observe_in_scene(k, points[p], tracks, views, optics, True, values)
+            else:
+                _observe(k, points[p], tracks, views, optics, True, values)
+            e0, e1 = values[RESIDUAL], values[RESIDUAL + 1]
             rho, weight = _robust(e0 * e0 + e1 * e1, loss, scale)
             total += 0.5 * rho
             b00, b01, b02 = _by_world_point(0, views.rotation, i, values)
@@ -533,7 +671,7 @@ def reduce(points, hold_points, anchors, first_track, stop_track, tracks, views,
             point_gradient[1] += weight * (e0 * b01 + e1 * b11)
             point_gradient[2] += weight * (e0 * b02 + e1 * b12)
             _by_blocks(k, values, tracks, views, widths, by_blocks)
-            for slot in range(4):
+            for slot in range(5):
                 column = views.columns[i, slot]
                 if column < 0:
                     continue
@@ -556,7 +694,7 @@ def reduce(points, hold_points, anchors, first_track, stop_track, tracks, views,
                     coupling[at, 1, j] += a0 * b01 + a1 * b11
                     coupling[at, 2, j] += a0 * b02 + a1 * b12
                     gradient[column + j] += a0 * e0 + a1 * e1
-                for other in range(4):
+                for other in range(5):
                     other_column = views.columns[i, other]
                     if other_column < column:
                         continue
@@ -571,6 +709,28 @@ def reduce(points, hold_points, anchors, first_track, stop_track, tracks, views,
                     change = points[p, j] - anchors.position[p, j]
                     total += 0.5 * weight * change * change
                     point_gradient[j] += weight * change
+        if on_rays and not hold_points:
+            _constraint(first, points[p], tracks, views, optics, widths, values, by_point, by_blocks)
+            refracted_ray(first, tracks, views, optics, origin, ray)
+            for slot in range(5):
+                column = views.columns[tracks.image[first], slot]
+                place_of_slot[slot] = -1
+                if column < 0:
+                    continue
+                at = place[column]
+                if at < 0:
+                    at = num_touched
+                    place[column] = at
+                    touched_column[at] = column
+                    touched_width[at] = widths[slot]
+                    num_touched += 1
+                    coupling[at] = 0.0
+                place_of_slot[slot] = at
+            total -= eliminate_length(
+                ray, by_point, by_blocks, place_of_slot, widths, v, point_gradient, coupling, touched_column,
+                touched_width, num_touched, shift, matrix, gradient,
+            )  # fmt: skip
+        elif not hold_points:
             _factor(v, 0.0, lower)
             y0, y1, y2 = _forward(lower, point_gradient[0], point_gradient[1], point_gradient[2])
             total -= 0.5 * (y0 * y0 + y1 * y1 + y2 * y2)
@@ -593,9 +753,24 @@ def reduce(points, hold_points, anchors, first_track, stop_track, tracks, views,
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def residuals(points, tracks, views, optics, out):
-    """Residuals (N, 2) in pixels of all observations at the given points, into `out`; no loss, no change."""
-    values = np.empty(_VALUES)
+    """Residuals (N, 2) of all observations at the given points, into `out`; no loss, no change."""
+    values = np.empty(VALUES)
     for p in range(points.shape[0]):
         for k in range(tracks.start[p], tracks.start[p + 1]):
-            _observe(k, points[p], tracks, views, optics, False, values)
-            out[k, 0], out[k, 1] = values[_RESIDUAL], values[_RESIDUAL + 1]
+            if tracks.scene.shape[0] > 0:
+                observe_in_scene(k, points[p], tracks, views, optics, False, values)
+            else:
+                _observe(k, points[p], tracks, views, optics, False, values)
+            out[k, 0], out[k, 1] = values[RESIDUAL], values[RESIDUAL + 1]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def surface_effects(points, tracks, views, optics, out):
+    """Pixels (N, 2, 3) per relative height and per slope of the surface under each keypoint, into `out`; with waves only."""
+    values = np.empty(VALUES)
+    for p in range(points.shape[0]):
+        for k in range(tracks.start[p], tracks.start[p + 1]):
+            _observe(k, points[p], tracks, views, optics, True, values)
+            for row in range(2):
+                out[k, row, 0] = values[BY_HEIGHT + row]
+                out[k, row, 1], out[k, row, 2] = values[BY_SLOPE + 2 * row], values[BY_SLOPE + 2 * row + 1]

@@ -16,7 +16,7 @@ change of the blocks into what the kernel needs, with its derivative.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import get_args
 
 import numpy as np
@@ -44,6 +44,8 @@ class Structure:
         plane_in_world: (B,) whether a plane is fixed in the world or in the camera.
         plane_anchor: (B, 3) the world point that a world plane's distance is measured from (an origin far
             from the cameras would make that unknown badly scaled); unused for planes in the camera.
+        wave_axes: (I, 3, 2) directions along each image's plane, camera frame, that the slopes of its waves are
+            counted along. They stay as they are while the plane moves a little. Unused without waves.
     """
 
     image_pose: Index
@@ -53,6 +55,7 @@ class Structure:
     sensor_translation: Array
     plane_in_world: NDArray[np.bool_]
     plane_anchor: Array
+    wave_axes: Array = field(default_factory=lambda: np.zeros((0, 3, 2)))
 
     @property
     def num_images(self) -> int:
@@ -77,6 +80,7 @@ class State:
         distance: (B,) from the projection centre, or from the plane's anchor, along the normal.
         index: refractive index of the medium the scene is in.
         lens: (C, Q) change of the refined intrinsics since the keypoints were lifted.
+        waves: (I, K) coefficients of the waves on each image's surface; K = 0, whatever I, where all are flat.
     """
 
     rotation: Array
@@ -85,6 +89,7 @@ class State:
     distance: Array
     index: float
     lens: Array
+    waves: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def cam_from_world(self, structure: Structure) -> tuple[Array, Array]:
         """`(rotation, translation)` of every image, (I, 3, 3) and (I, 3)."""
@@ -122,12 +127,14 @@ class Change:
         plane: (B, 3) tangential change of the normal (2) and change of the distance.
         index: change of the refractive index.
         lens: (C, Q) change of the refined intrinsics.
+        waves: (I, K) change of the wave coefficients.
     """
 
     pose: Array
     plane: Array
     index: float
     lens: Array
+    waves: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     @staticmethod
     def zero(state: State) -> Change:
@@ -136,6 +143,7 @@ class Change:
             plane=np.zeros((len(state.normal), 3)),
             index=0.0,
             lens=np.zeros_like(state.lens),
+            waves=np.zeros_like(state.waves),
         )
 
 
@@ -162,6 +170,7 @@ def apply(state: State, change: Change) -> State:
         distance=state.distance + change.plane[:, 2],
         index=state.index + change.index,
         lens=state.lens + change.lens,
+        waves=state.waves + change.waves,
     )
 
 
@@ -171,7 +180,7 @@ def evaluate_views(structure: Structure, state: State, change: Change, columns: 
     Args:
         structure, state: the tying and the values that `change` starts from.
         change: of the blocks.
-        columns: (I, 4) passed on to the kernel.
+        columns: (I, 5) passed on to the kernel.
 
     Returns:
         `Views` in the layout of `elimination`.
@@ -211,6 +220,8 @@ def evaluate_views(structure: Structure, state: State, change: Change, columns: 
         pose_map=pose_map,
         plane_map=plane_map,
         lens_change=np.ascontiguousarray(moved.lens[structure.image_camera]),
+        waves=moved.waves,
+        axes=structure.wave_axes,
         columns=columns,
     )
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from colmap_refract.estimator.elimination import Tracks
 from colmap_refract.estimator.optics import FAST, back_project
 from colmap_refract.estimator.scenario import State, Structure
+from colmap_refract.estimator.surface import local_planes
 from colmap_refract.interface import Array, Layers
 
 _ROUNDS = 6
@@ -28,11 +29,11 @@ def refracted_rays(tracks: Tracks, structure: Structure, state: State, layers: L
         image without an interface, and an observation marked dry, has its ray start at the camera.
     """
     rotation, translation = state.cam_from_world(structure)
-    normal, distance = state.planes_in_cam(structure)
+    normal, distance = local_planes(tracks, structure, state)
     image = tracks.image
     wet = tracks.wet & (structure.image_plane[image] >= 0)
     origin, ray = np.zeros_like(tracks.direction), tracks.direction.copy()
-    origin[wet], ray[wet] = back_project(tracks.direction[wet], normal[image[wet]], distance[image[wet]], layers)
+    origin[wet], ray[wet] = back_project(tracks.direction[wet], normal[wet], distance[wet], layers)
     origin = np.einsum("nji,nj->ni", rotation[image], origin - translation[image])
     return origin, np.einsum("nji,nj->ni", rotation[image], ray)
 

@@ -13,8 +13,11 @@ from uuid import uuid4
 from colmap_refract.errors import RefractError, reason_of
 from colmap_refract.files.model_files import MODEL_FILES
 from colmap_refract.files.sidecar import SIDECAR_NAME
+from colmap_refract.files.surface_files import SURFACES_NAME, foreign_file
 
-MODEL_AND_SIDECAR = (*MODEL_FILES, SIDECAR_NAME)
+POINT_STD_NAME = "point_std.csv"
+"""The table of the points' standard deviations that some commands write beside a model."""
+MODEL_AND_COMPANIONS = (*MODEL_FILES, SIDECAR_NAME, POINT_STD_NAME, SURFACES_NAME)
 WORK_PREFIX = ".colmap_refract-"  # of the temporary folders of `output_folder`
 # The user's to put right, wherever in the block they turn up.
 DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
@@ -26,7 +29,7 @@ def output_folder(
     *,
     input_path: str | Path | None,
     overwrite: bool,
-    own_files: Collection[str] = MODEL_AND_SIDECAR,
+    own_files: Collection[str] = MODEL_AND_COMPANIONS,
 ) -> Iterator[Path]:
     """A temporary folder whose files appear in `path` all together, and only if the block ends without an exception.
 
@@ -39,20 +42,21 @@ def output_folder(
         input_path: folder of what is read, such as the model to be refined, which must not be altered; None if there is
             none to mistake it for.
         overwrite: whether a folder that is not empty may be written to.
-        own_files: names that go when they are not written anew. By default a model's in both its forms: of one that
-            stays beside the other, readers would take it or be confused.
+        own_files: names that go when they are not written anew. By default a model's in both its forms, and what is
+            written beside it: of one that stays beside the other, readers would take it or be confused.
 
     Yields:
         An empty folder on the same disk.
 
     Raises:
         RefractError: `path` is the input, is a file, is not empty without `overwrite`, has a folder in the place of a
-            file, or cannot be written to. In the block: the disk is full.
+            file, has files of another origin in its folder of surfaces, or cannot be written to. In the block: the
+            disk is full.
     """
     path = Path(path)
     try:
         target = path.resolve()  # through a link, which stays
-        _check_output(path, target, input_path, overwrite)
+        _check_output(path, target, input_path, overwrite, own_files)
         missing = [parent for parent in target.parents if not parent.exists()]
     except (OSError, RuntimeError) as error:
         raise _cannot_write(path, error) from error
@@ -93,7 +97,9 @@ def output_folder(
                 folder.rmdir()
 
 
-def _check_output(path: Path, target: Path, input_path: str | Path | None, overwrite: bool) -> None:
+def _check_output(
+    path: Path, target: Path, input_path: str | Path | None, overwrite: bool, own_files: Collection[str]
+) -> None:
     if input_path is not None:
         source = Path(input_path).resolve()
         if target == source or (target.exists() and source.exists() and target.samefile(source)):
@@ -108,6 +114,12 @@ def _check_output(path: Path, target: Path, input_path: str | Path | None, overw
             f"the output folder {path} is not empty; choose another, or have what an earlier run wrote replaced "
             "(--overwrite 1)"
         )
+    foreign = foreign_file(target) if SURFACES_NAME in own_files else None
+    if foreign is not None:
+        raise RefractError(
+            f"{path / foreign.relative_to(target)} was not written by an earlier run, and the folder "
+            f"{SURFACES_NAME} would be replaced; move it away"
+        )
 
 
 def _cannot_write(path: Path, error: Exception) -> RefractError:
@@ -121,7 +133,7 @@ def _exchange(new: Path, target: Path, old: Path, own_files: Collection[str]) ->
     entering = sorted(os.listdir(new))
     moves = [(target / name, old / name) for name in sorted({*entering, *own_files}) if os.path.lexists(target / name)]
     for occupied, _ in moves:
-        if occupied.is_dir() and not (new / occupied.name).is_dir():
+        if occupied.is_dir() and not (new / occupied.name).is_dir() and occupied.name != SURFACES_NAME:
             raise RefractError(f"{occupied} is a folder where a file is to be written; move it away")
     moves += [(new / name, target / name) for name in entering]
     old.mkdir()

@@ -2,11 +2,20 @@
 
     {"format": "colmap_refract", "version": 1, "scenario": ...,
      "layers": [{"thickness": number, or null for the water, "refractive_index": number}, ...],
-     "images": {name: {"image_id", "normal_in_cam", "distance", "group", "normal_std_deg", "distance_std"}},
+     "images": {name: {"image_id", "normal_in_cam", "distance", "group", "normal_std_deg", "distance_std", "surface"}},
      "world_planes": {group: {"normal_in_world", "offset"}},
      "units": {...}, "options": {...}, "solver": {...}, "statistics": {...}}
 
 An image without an interface is listed with `normal_in_cam` and `distance` null. Lengths are in model units.
+
+`surface` is there where an image's interface is not flat:
+
+    {"axes": [[e1x, e2x], [e1y, e2y], [e1z, e2z]], "x": [...], "y": [...], "heights": [[...], ...],
+     "correlation_length", "slope_deviation"}
+
+as `colmap_refract.water_surface` has them: `heights[j][i]`, at the node `(x[i], y[j])` along the axes of the camera's
+frame, counts along `normal_in_cam`. The version is then 2, and 1 where all surfaces are flat: readers of version 1
+pass over keys that they do not know, and would take a wavy surface for a plane.
 """
 
 from __future__ import annotations
@@ -24,11 +33,15 @@ from typing import Any, NoReturn, TypeVar
 import numpy as np
 
 from colmap_refract.errors import RefractError
-from colmap_refract.interface import Layers
+from colmap_refract.interface import Array, Layers
+from colmap_refract.water_surface import WaterSurface
 
 SIDECAR_NAME = "refraction.json"
 FORMAT = "colmap_refract"
-VERSION = 1
+VERSION = 2
+_VERSION_OF_PLANES = 1
+_MOST_TILT = 0.5
+"""Of a surface's axes against its plane, a sine. Planes may have moved a little since the axes were laid."""
 
 Vector = tuple[float, float, float]
 T = TypeVar("T")
@@ -45,6 +58,7 @@ class ImageInterface:
         group: name of the interface that the image shares with others.
         normal_std_deg: standard deviation of the normal's direction, degrees.
         distance_std: standard deviation of the distance, model units.
+        surface: over the plane, model units; None where it is flat.
     """
 
     image_id: int
@@ -53,6 +67,7 @@ class ImageInterface:
     group: str | None = None
     normal_std_deg: float | None = None
     distance_std: float | None = None
+    surface: WaterSurface | None = None
 
     def __post_init__(self) -> None:
         if (self.normal_in_cam is None) != (self.distance is None):
@@ -61,6 +76,11 @@ class ImageInterface:
             _check_unit(self.normal_in_cam, "normal_in_cam")
         if self.distance is not None and not (math.isfinite(self.distance) and self.distance > 0):
             raise RefractError(f"distance {self.distance:g} is not positive; it is from the camera to the plane")
+        if self.surface is not None:
+            if self.normal_in_cam is None:
+                raise RefractError("a surface is given without its plane; give normal_in_cam and distance, too")
+            if np.abs(self.normal_in_cam @ self.surface.axes).max() > _MOST_TILT:
+                raise RefractError("the axes of a surface do not lie along its plane; they are in the camera's frame")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,9 +117,10 @@ def write_sidecar(sidecar: Sidecar, path: str | Path) -> None:
         path: the file to be written.
     """
     layers = sidecar.layers
-    document = {
+    wavy = any(image.surface is not None for image in sidecar.images.values())
+    document: dict[str, Any] = {
         "format": FORMAT,
-        "version": VERSION,
+        "version": VERSION if wavy else _VERSION_OF_PLANES,
         "scenario": sidecar.scenario,
         "layers": [
             {"thickness": thickness, "refractive_index": index}
@@ -111,6 +132,9 @@ def write_sidecar(sidecar: Sidecar, path: str | Path) -> None:
             if part.name not in ("scenario", "layers")
         },
     }
+    for image in document["images"].values():
+        if image["surface"] is None:
+            del image["surface"]
     text = json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     # Half a surrogate pair has no UTF-8, and its backslash form is just how JSON escapes it.
     Path(path).write_bytes(text.encode("utf-8", "backslashreplace"))
@@ -253,7 +277,7 @@ def _layers(value: Any) -> Layers:
 
 
 def _image_interface(value: Any) -> ImageInterface:
-    entry = {"group": None, "normal_std_deg": None, "distance_std": None, **_object(value)}
+    entry = {"group": None, "normal_std_deg": None, "distance_std": None, "surface": None, **_object(value)}
     return ImageInterface(
         image_id=_get(entry, "image_id", _integer),
         normal_in_cam=_get(entry, "normal_in_cam", _optional(_vector)),
@@ -261,7 +285,33 @@ def _image_interface(value: Any) -> ImageInterface:
         group=_get(entry, "group", _optional(_text)),
         normal_std_deg=_get(entry, "normal_std_deg", _optional(_number)),
         distance_std=_get(entry, "distance_std", _optional(_number)),
+        surface=_get(entry, "surface", _optional(_surface)),
     )
+
+
+def _surface(value: Any) -> WaterSurface:
+    entry = {"slope_deviation": None, **_object(value)}
+    return WaterSurface(
+        axes=_get(entry, "axes", _matrix),
+        x=_get(entry, "x", _numbers),
+        y=_get(entry, "y", _numbers),
+        heights=_get(entry, "heights", _matrix),
+        correlation_length=_get(entry, "correlation_length", _number),
+        slope_deviation=_get(entry, "slope_deviation", _optional(_number)),
+    )
+
+
+def _numbers(value: Any) -> Array:
+    if not isinstance(value, list):
+        raise ValueError("not a list of numbers")
+    return np.array([_number(item) for item in value], dtype=np.float64)
+
+
+def _matrix(value: Any) -> Array:
+    rows = [_numbers(row) for row in value] if isinstance(value, list) else []
+    if not rows or len({len(row) for row in rows}) > 1:
+        raise ValueError("not a list of equally long lists of numbers")
+    return np.array(rows)
 
 
 def _world_plane(value: Any) -> WorldPlane:

@@ -382,7 +382,7 @@ def residuals(problem: Problem) -> Array:
     """Residuals (N, 2) in px at the problem's state and points."""
     views = evaluate_views(
         problem.structure, problem.state, Change.zero(problem.state),
-        np.full((problem.structure.num_images, 4), -1, dtype=np.int32),
+        np.full((problem.structure.num_images, 5), -1, dtype=np.int32),
     )  # fmt: skip
     out = np.empty((len(problem.tracks.image), 2))
     elimination.residuals(problem.points, problem.tracks, views, problem.optics, out)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from colmap_refract.estimator.chunk import Problem
 from colmap_refract.estimator.optics import is_wet, project_direction
+from colmap_refract.estimator.surface import local_planes
 from colmap_refract.estimator.triangulation import triangulation_angles
 from colmap_refract.interface import Array
 from colmap_refract.refiner.observations import Observations, pixel_errors
@@ -34,15 +35,18 @@ class Filtered:
 
 
 def in_cameras(problem: Problem) -> tuple[Array, Array, Array]:
-    """Points (N, 3), normals (N, 3) and distances (N,) of all observations in their cameras' frames."""
+    """Points (N, 3), normals (N, 3) and distances (N,) of all observations in their cameras' frames.
+
+    The planes are those that the observations are refracted by: with waves, each has its own.
+    """
     rotation, translation = problem.state.cam_from_world(problem.structure)
-    normal, distance = problem.state.planes_in_cam(problem.structure)
+    normal, distance = local_planes(problem.tracks, problem.structure, problem.state)
     image = problem.tracks.image
     point = np.repeat(problem.points, np.diff(problem.tracks.start), axis=0)
     return (
         np.einsum("nij,nj->ni", rotation[image], point) + translation[image],
-        normal[image],
-        distance[image],
+        normal,
+        distance,
     )
 
 

@@ -37,7 +37,18 @@ from colmap_refract.refiner.filtering import label_wet, pinhole_errors, reprojec
 from colmap_refract.refiner.observations import read_observations
 from colmap_refract.refiner.outcome import make_sidecar, output_frame, statistics, write_back
 from colmap_refract.refiner.selection import Selection
+from colmap_refract.refiner.soft import (
+    SoftSolution,
+    Unsupported,
+    filter_waves,
+    go_on,
+    level_start,
+    settle_everywhere,
+    solve_soft,
+    wave_options,
+)
 from colmap_refract.refiner.uncertainty import Uncertainty, estimate_uncertainty
+from colmap_refract.refiner.wave_output import add_waves
 
 if TYPE_CHECKING:
     import pycolmap
@@ -61,6 +72,7 @@ _FINISHED = 5e-5
 _FINE = 1e-6
 _FINER = 1e-2
 """Tolerance of each further solve over that of the last, where more than that is left."""
+_NUM_WAVE_FILTERS = 3
 _NEGLIGIBLE_CHANGE = 1e-3
 """Part of the observations whose removal or relabelling is not worth another solve."""
 
@@ -112,6 +124,8 @@ def refine(
         KeyboardInterrupt: Ctrl-C during a solve; nothing has been changed.
     """
     started = perf_counter()
+    if not isinstance(options, RefinerOptions) or options.interface_shape == "auto":
+        raise RefractError("the scenario or the interface_shape is auto: have choose_scenario find it")
     notes = notes or ImageNotes()
     model = copy_model(reconstruction)
     _check_model(model)
@@ -134,8 +148,20 @@ def refine(
         function_tolerance=options.BundleAdjustment.function_tolerance,
     )
     solve_started = perf_counter()
+    remarks_on_waves: list[str] = []
+    soft: SoftSolution | None = None
     try:
-        selection, problem, adjustment, uncertainty = _solve(arrangement, settings, earlier, watch)
+        if options.interface_shape == "soft":
+            _check_waves(arrangement)
+            try:
+                selection, soft = _solve_soft(arrangement, settings, earlier, watch)
+            except Unsupported as unsupported:
+                remarks_on_waves = [f"{unsupported}; the interfaces are taken to be flat."]
+        if soft is None:
+            selection, problem, adjustment, uncertainty = _solve(arrangement, settings, earlier, watch)
+        else:
+            problem, adjustment = soft.wavy.problem, soft.adjustment
+            uncertainty = estimate_uncertainty(soft.solved)
     except FloatingPointError as error:
         raise RefractError(
             f"the adjustment could not be evaluated ({error}): check the model and the scenario"
@@ -143,7 +169,7 @@ def refine(
     solve_seconds = perf_counter() - solve_started
     arrangement, _ = selection.active()
     errors = reprojection_errors(problem, arrangement.observations)
-    noise = estimate_noise(problem)
+    noise = estimate_noise(problem) if soft is None else soft.statistics.noise
     facts = Facts(
         arrangement=arrangement,
         problem=problem,
@@ -156,12 +182,14 @@ def refine(
     )
     # A model that comes from a refinement says nothing of its input any more.
     about_input = [*remarks, *advise_on_input(facts)] if earlier is None else earlier.solver.get("input_warnings", [])
-    warnings = [*about_input, *advise(facts)]
+    warnings = [*about_input, *remarks_on_waves, *advise(facts)]
     to_output = output_frame(arrangement, problem.state, problem.points)
     stays = arrangement.observations if averaged is None else observations.select(averaged.members(selection.keep))
     write_back(model, arrangement, problem, errors, to_output, stays)
     sidecar = make_sidecar(arrangement, notes, problem, adjustment, uncertainty, noise, to_output, warnings)
     sidecar.solver["input_warnings"] = about_input
+    if soft is not None:
+        add_waves(sidecar, arrangement, soft, to_output.scale)
     seconds = (solve_seconds, perf_counter() - started)
     sidecar.statistics.update(
         statistics(reconstruction, model, before, errors, selection, num_unusable, problem, noise, seconds)
@@ -265,6 +293,47 @@ def _solve(
     if not is_sound(problem):
         _raise_unsound(problem, options)
     return selection, problem, adjustment, uncertainty
+
+
+def _check_waves(arrangement: Arrangement) -> None:
+    options = arrangement.options
+    if options.scenario == "camera_housing":
+        raise RefractError("a housing's port does not wave: use interface_shape plane, or the scenario of open water")
+    if any(options.layer_thickness):
+        raise RefractError("a wall does not wave: use interface_shape plane, or leave out layer_thickness")
+
+
+def _solve_soft(
+    arrangement: Arrangement, settings: SolverSettings, earlier: Sidecar | None, watch: Watch | None
+) -> tuple[Selection, SoftSolution]:
+    """Start on level water, solve with waves, filter and go on until nothing more comes or goes."""
+    options = arrangement.options
+    if earlier is not None:
+        begin = arrangement.resume(earlier)
+    elif options.scenario == "fixed_camera":
+        begin = _from_scratch(arrangement, settings, watch)
+    else:
+        begin = level_start(arrangement)
+    everything = np.ones(len(begin.tracks.image), dtype=np.bool_)
+    soft = solve_soft(arrangement, begin, everything, wave_options(arrangement, begin), settings, watch)
+    everywhere, keep = soft.wavy.problem, everything
+    marks = None
+    for _ in range(_NUM_WAVE_FILTERS):
+        marks = filter_waves(arrangement, everywhere)
+        counts = np.add.reduceat(marks.keep.astype(np.int64), begin.tracks.start[:-1])
+        remaining = marks.keep & np.repeat(counts >= 2, np.diff(begin.tracks.start))
+        changed = float((remaining != keep).mean())
+        keep = remaining
+        if changed <= _NEGLIGIBLE_CHANGE:
+            break
+        soft = go_on(begin, everywhere, keep, soft, settings, watch)
+        everywhere = settle_everywhere(begin, everywhere, keep, soft)
+    if not keep.all() and len(soft.wavy.problem.tracks.image) != int(keep.sum()):
+        soft = go_on(begin, everywhere, keep, soft, settings, watch)
+    problem = soft.wavy.problem
+    if not is_sound(problem):
+        _raise_unsound(problem, options)
+    return Selection(arrangement=arrangement, problem=begin, keep=keep, marks=marks), soft
 
 
 def _from_scratch(arrangement: Arrangement, settings: SolverSettings, watch: Watch | None) -> Problem:

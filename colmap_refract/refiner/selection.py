@@ -43,14 +43,7 @@ class Selection:
             return self.arrangement, self.problem
         observations = self.arrangement.observations.select(self.keep)
         tracks = self.problem.tracks
-        active = tracks._replace(
-            start=observations.start,
-            image=tracks.image[self.keep],
-            direction=tracks.direction[self.keep],
-            metric=tracks.metric[self.keep],
-            lens=tracks.lens[self.keep],
-            wet=tracks.wet[self.keep],
-        )
+        active = tracks.take(observations.start, self.keep)
         points = self.problem.points[self.keep_point]
         return replace(self.arrangement, observations=observations), replace(self.problem, tracks=active, points=points)
 

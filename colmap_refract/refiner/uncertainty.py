@@ -18,12 +18,12 @@ from scipy.linalg import null_space
 from scipy.sparse.linalg import splu
 
 from colmap_refract.estimator.adjustment import SolverSettings, settle_points
-from colmap_refract.estimator.chunk import Problem, change_of, slot_width, split
-from colmap_refract.estimator.elimination import MEDIUM, PLANE, POSE, Tracks
+from colmap_refract.estimator.chunk import Problem, change_of, slot_width
+from colmap_refract.estimator.elimination import LEVEL, MEDIUM, PLANE, POSE
+from colmap_refract.estimator.priors import mean_plane
 from colmap_refract.estimator.scenario import apply
 from colmap_refract.interface import Array, tangent_basis
-
-Key = tuple[int, int]
+from colmap_refract.refiner.normal_equations import Key, normal_equations
 
 _STEP = 1e-4
 """Radians, or of the median depth: small against what moves a point by much, large against how well it is settled."""
@@ -69,14 +69,11 @@ def gauge(problem: Problem, keys: list[Key], columns: dict[Key, int], num_column
         by = np.zeros((3, 7))
         by[2, 6] = state.distance[b]
         if structure.plane_in_world[b]:
-            anchor = structure.plane_anchor[b]
-            by[2, :3] = normal
-            for j, axis in enumerate(np.eye(3)):
-                turned = np.cross(axis, normal)
-                by[:2, 3 + j] = tangent_basis(normal).T @ turned
-                by[2, 3 + j] = -turned @ anchor
-            by[2, 6] += normal @ anchor
+            by = _similarity_of_plane(normal, float(state.distance[b]), structure.plane_anchor[b])
         full[PLANE, b] = by
+    if (LEVEL, 0) in columns:
+        level = mean_plane(structure, state)
+        full[LEVEL, 0] = _similarity_of_plane(level.normal, level.distance, level.anchor)
     scale_fixed = np.abs(structure.sensor_translation).max() > 1e-12
     directions = np.eye(7)[:, : 6 if scale_fixed or problem.held.points else 7]
     # Only combinations that leave all that is held where it is are free.
@@ -95,6 +92,18 @@ def gauge(problem: Problem, keys: list[Key], columns: dict[Key, int], num_column
             by = full[key] @ directions
             result[columns[key] : columns[key] + len(by)] = by
     return result
+
+
+def _similarity_of_plane(normal: Array, distance: float, anchor: Array) -> Array:
+    """How a world plane's block (3,) follows shifts, turns and growth of the world (3, 7)."""
+    by = np.zeros((3, 7))
+    by[2, :3] = normal
+    for j, axis in enumerate(np.eye(3)):
+        turned = np.cross(axis, normal)
+        by[:2, 3 + j] = tangent_basis(normal).T @ turned
+        by[2, 3 + j] = -turned @ anchor
+    by[2, 6] = distance + normal @ anchor
+    return by
 
 
 def _fixed_columns(problem: Problem, columns: dict[Key, int]) -> NDArray[np.int64]:
@@ -119,7 +128,7 @@ def _growth_of_points(problem: Problem, keys: list[Key], columns: dict[Key, int]
     take = np.arange(start[-1]) + np.repeat(tracks.start[chosen] - start[:-1], lengths)
     few = replace(
         problem,
-        tracks=Tracks(start, *(part[take] for part in tracks[1:])),
+        tracks=tracks.take(start, take),
         points=problem.points[chosen],
     )
     settings = SolverSettings(num_threads=1)
@@ -148,36 +157,16 @@ def estimate_uncertainty(problem: Problem) -> Uncertainty:
     Returns:
         `Uncertainty`, per pixel of noise; NaN for planes that are held or undetermined.
     """
-    chunks = split(problem, 1)
-    keys = sorted({key for chunk in chunks for key in chunk.keys})
-    widths = {key: width for chunk in chunks for key, width in zip(chunk.keys, chunk.widths, strict=True)}
-    firsts = np.concatenate([[0], np.cumsum([widths[key] for key in keys])]).astype(int)
-    columns = dict(zip(keys, firsts[:-1].tolist(), strict=True))
-    n = int(firsts[-1])
     num_planes = len(problem.state.normal)
     nan = np.full(num_planes, np.nan)
     unknown = Uncertainty(
         normal=nan, distance=nan.copy(), index=np.nan, index_correlation=np.nan, decrement=0.0, determined=False
     )
-    if n == 0:
+    system = normal_equations(problem)
+    if system is None or not system.keys:
         return unknown
-    gradient = np.zeros(n)
-    cost = 0.0
-    rows, cols, values = [], [], []
-    for chunk in chunks:
-        reduced = chunk.reduce([np.zeros(w) for w in chunk.widths], None)
-        if reduced is None:
-            return unknown
-        place = np.concatenate([columns[key] + np.arange(widths[key]) for key in chunk.keys]).astype(np.int64)
-        matrix = np.triu(reduced[2])
-        matrix = matrix + np.triu(matrix, 1).T
-        i, j = np.nonzero(matrix)
-        rows.append(place[i])
-        cols.append(place[j])
-        values.append(matrix[i, j])
-        gradient[place] += reduced[1]
-        cost += reduced[0]
-    hessian = sp.csc_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(cols))), shape=(n, n))
+    keys, columns, widths, n = system.keys, system.columns, system.widths, len(system.gradient)
+    hessian, gradient, cost = system.hessian, system.gradient, system.cost
     free = np.setdiff1d(np.arange(n), _fixed_columns(problem, columns))
     hessian = hessian[free][:, free]
     diagonal = hessian.diagonal()

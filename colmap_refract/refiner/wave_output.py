@@ -1,0 +1,55 @@
+"""What a solution with waves leaves beside the model: a surface per image, and what is known of the waves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from colmap_refract.estimator.random_surface import Modes
+from colmap_refract.files.sidecar import Sidecar
+from colmap_refract.interface import Array
+from colmap_refract.refiner.arrangement import Arrangement
+from colmap_refract.refiner.soft import SoftSolution
+from colmap_refract.water_surface import sampled
+
+_CORRELATION_PER_WAVELENGTH = 1.0 / (np.sqrt(2.0) * np.pi)
+"""A sinusoid near its crests is like a field of this correlation length."""
+
+
+def add_waves(sidecar: Sidecar, arrangement: Arrangement, soft: SoftSolution, scale: float) -> None:
+    """Put the surfaces and the statistics of the waves into the sidecar; lengths become the output's by `scale`."""
+    problem, statistics = soft.wavy.problem, soft.statistics
+    tracks = problem.tracks
+    normal, distance = problem.state.planes_in_cam(problem.structure)
+    for i, name in enumerate(arrangement.observations.image_names):
+        shapes = soft.wavy.modes[i]
+        if shapes is None:
+            continue
+        mine = tracks.image == i
+        coefficients = problem.state.waves[i, : shapes.shapes.shape[1]]
+
+        def heights(at: Array, shapes: Modes = shapes, coefficients: Array = coefficients) -> Array:
+            return np.asarray(shapes.at(at)[:, 0] @ coefficients)
+
+        axes = problem.structure.wave_axes[i]
+        foot = tracks.sight[mine] / (tracks.sight[mine] @ normal[i])[:, None]
+        surface = sampled(
+            heights,
+            foot @ axes,
+            axes=axes,
+            correlation_length=shapes.surface.wavelength * _CORRELATION_PER_WAVELENGTH,
+            slope_deviation=statistics.slope_deviation,
+        )
+        sidecar.images[name] = replace(sidecar.images[name], surface=surface.scaled(scale * float(distance[i])))
+    typical = scale * float(np.nanmedian(distance))
+    waves = {
+        "slope_deviation_deg": float(np.degrees(np.arctan(statistics.slope_deviation))),
+        "wavelength": statistics.wavelength * typical,
+        "explained": soft.wavy.explained,
+        "noise_px": statistics.noise,
+    }
+    if soft.level is not None:
+        waves["level_tilt_deg"] = float(np.degrees(soft.level.tilt))
+        waves["level_lift"] = soft.level.lift * typical
+    sidecar.statistics["waves"] = waves

@@ -1,0 +1,160 @@
+"""What the data say of the waves: how steep and how long they are, and how far planes scatter about the level.
+
+The statistics are those that make the data most probable, to the second order about a solution (empirical Bayes;
+the updates of MacKay 1992). They need not be exact: halving or doubling one changes the points by little.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import block_diag, cho_factor, cho_solve
+
+from colmap_refract.estimator.chunk import LevelPrior, Problem
+from colmap_refract.estimator.elimination import LEVEL, PLANE, POSE, WAVES
+from colmap_refract.estimator.priors import compare_to_level, first_images, mean_plane, plane_stands
+from colmap_refract.interface import Array, tangent_basis
+from colmap_refract.refiner.continuation import residuals
+from colmap_refract.refiner.normal_equations import NormalEquations, normal_equations
+from colmap_refract.refiner.waves import WaveStatistics, images_with_waves
+
+_JITTER = 1e-9
+"""Of the scaled diagonal: what the gauge leaves without curvature."""
+_LEAST_SLOPE, _MOST_SLOPE = np.tan(np.radians(0.02)), np.tan(np.radians(20.0))
+_LEAST_TILT, _LEAST_LIFT = np.radians(0.01), 1e-4
+_LARGEST_FACTOR = 3.0
+"""By which one update may change a deviation."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Posterior:
+    """The normal equations at a solution, with what the statistics need of their inverse.
+
+    Attributes:
+        system: in px^2.
+        covariance: (n, n) of the parameters for residuals of unit noise.
+    """
+
+    system: NormalEquations
+    covariance: Array
+
+
+def posterior(problem: Problem) -> Posterior | None:
+    """None where the system cannot be evaluated; dense, so for some hundred to a few thousand unknowns."""
+    system = normal_equations(problem)
+    if system is None or not system.keys:
+        return None
+    matrix = system.hessian.toarray()
+    diagonal = np.diag(matrix).copy()
+    if not (diagonal > 0).all():
+        return None
+    scale = 1.0 / np.sqrt(diagonal)
+    scaled = matrix * scale * scale[:, None]
+    scaled[np.diag_indices_from(scaled)] += _JITTER
+    inverse = cho_solve(cho_factor(scaled), np.eye(len(scaled)))
+    return Posterior(system=system, covariance=inverse * scale * scale[:, None])
+
+
+def estimate_statistics(
+    problem: Problem, statistics: WaveStatistics, *, given_slope: bool, given_noise: bool
+) -> tuple[WaveStatistics, LevelPrior | None]:
+    """One update of slope deviation, noise and level prior at a solution with waves.
+
+    Args:
+        problem: at its solution.
+        statistics: that it was solved with.
+        given_slope, given_noise: what stays as it is.
+    """
+    level = problem.level_prior
+    found = posterior(problem)
+    if found is None:
+        return statistics, level
+    system, variance = found.system, np.diag(found.covariance)
+    unit = statistics.noise**2
+    determined, squared = 0.0, 0.0
+    for image in images_with_waves(problem).tolist():
+        if (WAVES, image) not in system.columns:
+            continue
+        first = system.columns[WAVES, image]
+        mine = np.arange(first, first + problem.num_waves)
+        determined += float((1.0 - np.minimum(unit * variance[mine], 1.0)).sum())
+        squared += float((problem.state.waves[image] ** 2).sum())
+    slope = statistics.slope_deviation
+    if not given_slope and determined > 1.0:
+        factor = np.clip(np.sqrt(squared / determined), 1.0 / _LARGEST_FACTOR, _LARGEST_FACTOR)
+        slope = float(np.clip(slope * factor, _LEAST_SLOPE, _MOST_SLOPE))
+    noise = statistics.noise
+    if not given_noise:
+        unknowns = 3 * len(problem.points) + determined
+        unknowns += sum(width for key, width in system.widths.items() if key[0] in (POSE, PLANE))
+        noise = _noise(problem, unknowns)
+    if level is not None:
+        level = _scatter(problem, replace(level, noise=noise), found, statistics.noise)
+    return replace(statistics, slope_deviation=slope, noise=noise), level
+
+
+def _noise(problem: Problem, unknowns: float) -> float:
+    """Robust standard deviation, px, of a keypoint coordinate, from residuals of which some fit by themselves."""
+    error = residuals(problem)
+    spread = 1.4826 * float(np.median(np.abs(error)))
+    freedom = max(error.size - unknowns, 0.05 * error.size)
+    return max(spread * float(np.sqrt(error.size / freedom)), 1e-6)
+
+
+def _scatter(problem: Problem, level: LevelPrior, found: Posterior, noise: float) -> LevelPrior:
+    """The level prior with the spread that the planes show."""
+    structure, state, system = problem.structure, problem.state, found.system
+    plane = mean_plane(structure, state)
+    along = block_diag(tangent_basis(plane.normal).T, 1.0)
+    deviations, variances = [], []
+    for block, image in enumerate(first_images(structure).tolist()):
+        pose = int(structure.image_pose[image])
+        standing = plane_stands(structure, state, block, image, np.zeros(6), np.zeros(3))
+        deviation, *by = compare_to_level(standing, plane, np.zeros(3))
+        deviation, by = along @ deviation, [along @ part for part in by]
+        jacobian = np.zeros((3, len(system.gradient)))
+        for key, part in zip([(POSE, pose), (PLANE, block), (LEVEL, 0)], by, strict=True):
+            if key in system.columns:
+                jacobian[:, system.columns[key] : system.columns[key] + system.widths[key]] += part
+        deviations.append(deviation)
+        variances.append(noise**2 * np.einsum("ij,jk,ik->i", jacobian, found.covariance, jacobian))
+    squared, variance = np.array(deviations) ** 2, np.array(variances)
+    tilt = _deviation(squared[:, :2], variance[:, :2], level.tilt)
+    lift = _deviation(squared[:, 2:], variance[:, 2:], level.lift)
+    return replace(level, tilt=max(tilt, _LEAST_TILT), lift=max(lift, _LEAST_LIFT))
+
+
+def _deviation(squared: Array, variance: Array, assumed: float) -> float:
+    """The standard deviation that squared values show which are known up to a variance, assumed before."""
+    determined = float((1.0 - np.minimum(variance / assumed**2, 1.0)).sum())
+    # A common plane takes away one degree of freedom.
+    determined *= max(len(squared) - 1, 1) / len(squared)
+    if determined < 1e-3 * squared.size:
+        return assumed
+    factor = np.sqrt(squared.sum() / determined) / assumed
+    return float(assumed * np.clip(factor, 1.0 / _LARGEST_FACTOR, _LARGEST_FACTOR))
+
+
+def log_evidence(problem: Problem, noise: float, log_whitening: float) -> float:
+    """Log probability of the data at a solution, up to a constant: what the choice of a wavelength goes by.
+
+    Args:
+        problem: at its solution.
+        noise: px.
+        log_whitening: sum of the log determinants of the observations' whitening.
+    """
+    system = normal_equations(problem)
+    if system is None:
+        return -np.inf
+    hessian = system.hessian
+    mine = [
+        np.arange(system.columns[key], system.columns[key] + system.widths[key])
+        for key in system.keys
+        if key[0] == WAVES
+    ]
+    volume = 0.0
+    if mine:
+        at = np.concatenate(mine)
+        volume = 0.5 * float(np.linalg.slogdet(hessian[at][:, at].toarray() / noise**2)[1])
+    return -system.cost / noise**2 - volume + log_whitening

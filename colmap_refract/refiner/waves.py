@@ -1,0 +1,186 @@
+"""Waves on a problem whose surfaces were flat: a random surface over each image, and what it cannot resolve as noise.
+
+A surface is a sum of `modes`, its most probable shapes, whose coefficients are unknowns of unit variance. Where a
+keypoint's ray meets it follows from the latest solution: the design is made anew a few times (`with_waves`).
+
+Two things keep the solution from being biased, and both matter more than the pixel noise itself:
+
+- The surface is looked up where the *solution* sees a point, not where its keypoint is. A keypoint's noise moves the
+  place, the slope there moves with it, and the product of the two looks like a lens.
+- The last solves take the waves' effects on the pixels as they stand (`frozen`): generalised least squares with
+  a known covariance. With effects that follow the solution, deeper water explains the same noise by smaller waves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_refract.estimator import elimination
+from colmap_refract.estimator.chunk import Problem
+from colmap_refract.estimator.random_surface import Modes, RandomSurface, modes, node_grid
+from colmap_refract.estimator.scenario import Change, evaluate_views
+from colmap_refract.estimator.surface import local_planes
+from colmap_refract.interface import Array, tangent_basis
+from colmap_refract.refiner.continuation import residuals
+from colmap_refract.refiner.filtering import predicted_directions
+
+_FIT = 1e-3
+"""Of the slope deviation: how closely the coefficients follow the surface when its design changes."""
+_MOST_ADRIFT = 3.0
+"""Noise deviations between keypoint and solution up to which the solution says where a ray meets the surface."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WaveStatistics:
+    """What is known or assumed of the waves.
+
+    Attributes:
+        slope_deviation: root mean square slope over both axes, a tangent.
+        wavelength: the dominant one, over the median distance of the interfaces.
+        noise: of a keypoint coordinate, px.
+    """
+
+    slope_deviation: float
+    wavelength: float
+    noise: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wavy:
+    """A problem with waves.
+
+    Attributes:
+        problem: every observation with a local plane of its own.
+        modes: (I,) the shapes on each image's plane, lengths over its distance; None for images without interface.
+        explained: the part of the slopes' variance that the modes can take; the rest counts as noise.
+    """
+
+    problem: Problem
+    modes: list[Modes | None]
+    explained: float
+
+
+def with_waves(flat: Problem, statistics: WaveStatistics, num_modes: int, current: Problem | None = None) -> Wavy:
+    """Put waves on all surfaces of a problem.
+
+    Args:
+        flat: without waves; its observations, tying and metric.
+        statistics: of the waves; the prior.
+        num_modes: coefficients per image, at most.
+        current: the latest solution of the same observations, with waves or not, to go on from; else `flat`'s state.
+    """
+    structure, tracks = flat.structure, flat.tracks
+    solution = flat if current is None else current
+    normal, distance = solution.state.planes_in_cam(structure)
+    typical = float(np.nanmedian(distance))
+    refracted = structure.image_plane >= 0
+    axes = np.zeros((structure.num_images, 3, 2))
+    for image in np.flatnonzero(refracted).tolist():
+        axes[image] = tangent_basis(normal[image])
+    sight, relief = tracks.direction, np.zeros((len(tracks.image), 3))
+    if current is not None:
+        sight = _sight(current, statistics.noise)
+        relief = relief_of(current, axes)
+    with np.errstate(invalid="ignore"):
+        foot = sight / np.einsum("ni,ni->n", sight, normal[tracks.image])[:, None]
+    places = np.einsum("nia,ni->na", axes[tracks.image], foot) * (1.0 + relief[:, :1])
+    by_image: list[Modes | None] = [None] * structure.num_images
+    waves = np.zeros((len(tracks.image), 3, num_modes))
+    coefficients = np.zeros((structure.num_images, num_modes))
+    tolerance = _FIT * statistics.slope_deviation
+    for image in np.flatnonzero(refracted).tolist():
+        mine = np.flatnonzero((tracks.image == image) & np.isfinite(places).all(axis=1))
+        if not len(mine):
+            continue
+        length = statistics.wavelength * typical / distance[image]
+        surface = RandomSurface(slope_deviation=statistics.slope_deviation, wavelength=length)
+        shapes = modes(surface, node_grid(places[mine], length), num_modes)
+        by_image[image] = shapes
+        # The normal leans against the slope.
+        design = shapes.at(places[mine]) * np.array([1.0, -1.0, -1.0])[:, None]
+        waves[mine, :, : design.shape[2]] = design
+        if current is not None:
+            stacked = design.reshape(-1, design.shape[2]) / tolerance
+            system = stacked.T @ stacked + np.eye(design.shape[2])
+            right = stacked.T @ relief[mine].ravel() / tolerance
+            coefficients[image, : design.shape[2]] = np.linalg.solve(system, right)
+    wavy = replace(
+        solution,
+        tracks=tracks._replace(waves=waves, sight=np.ascontiguousarray(sight)),
+        structure=replace(structure, wave_axes=axes),
+        state=replace(solution.state, waves=coefficients),
+        wave_prior=np.tile(statistics.noise * np.eye(num_modes), (structure.num_images, 1, 1)),
+    )
+    per_axis = 0.5 * statistics.slope_deviation**2
+    left = per_axis * np.eye(2) - np.einsum("nak,nbk->nab", waves[:, 1:], waves[:, 1:])
+    share = np.einsum("naa->n", left)[refracted[tracks.image]] / (2.0 * per_axis)
+    whiten = _whitening(surface_effects(wavy)[:, :, 1:], left, statistics.noise)
+    whitened = wavy.tracks._replace(metric=whiten @ tracks.metric, lens=whiten @ tracks.lens)
+    return Wavy(problem=replace(wavy, tracks=whitened), modes=by_image, explained=float(1.0 - share.mean()))
+
+
+def _sight(current: Problem, noise: float) -> Array:
+    """Where a solution sees its points, or the keypoint where it does not see them near there (a wrong match)."""
+    tracks = current.tracks
+    seen = predicted_directions(current)
+    adrift = np.linalg.norm(np.einsum("nij,nj->ni", tracks.metric, seen - tracks.direction), axis=1)
+    near = np.isfinite(adrift) & (adrift < _MOST_ADRIFT * noise)
+    return np.where(near[:, None], seen, tracks.direction)
+
+
+def _whitening(effect: Array, covariance: Array, noise: float) -> Array:
+    """(N, 2, 2) that gives residuals with additional slopes of some covariance the variance of the noise."""
+    total = np.eye(2) + effect @ covariance @ effect.transpose(0, 2, 1) / noise**2
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(total)))
+
+
+def relief_of(problem: Problem, axes: Array) -> Array:
+    """Height over the plane's distance, and parts of the normal along `axes` (I, 3, 2), of each keypoint's surface."""
+    if not problem.num_waves or not problem.tracks.waves.shape[2]:
+        return np.zeros((len(problem.tracks.image), 3))
+    normal, distance = problem.state.planes_in_cam(problem.structure)
+    local, local_distance = local_planes(problem.tracks, problem.structure, problem.state)
+    image, ray = problem.tracks.image, problem.tracks.sight
+    normal, distance = normal[image], distance[image]
+    reach = local_distance / np.einsum("ni,ni->n", local, ray)
+    tilted = local / np.einsum("ni,ni->n", local, normal)[:, None] - normal
+    height = reach * np.einsum("ni,ni->n", normal, ray) / distance - 1.0
+    return np.column_stack([height, np.einsum("nia,ni->na", axes[image], tilted)])
+
+
+def surface_effects(problem: Problem) -> Array:
+    """Pixels (N, 2, 3) by height and slopes of the local surface, at the problem's waves."""
+    views = evaluate_views(
+        problem.structure, problem.state, Change.zero(problem.state),
+        np.full((problem.structure.num_images, 5), -1, dtype=np.int32),
+    )  # fmt: skip
+    out = np.zeros((len(problem.tracks.image), 2, 3))
+    elimination.surface_effects(problem.points, problem.tracks, views, problem.optics, out)
+    return out
+
+
+def frozen(wavy: Problem) -> Problem:
+    """The problem with the waves' effects on the pixels as they are at its state: linear in the coefficients."""
+    tracks = wavy.tracks
+    flat = replace(wavy, tracks=tracks._replace(waves=np.zeros((0, 3, 0)), sight=np.zeros((0, 3))))
+    effects = surface_effects(wavy) @ tracks.waves
+    now = np.einsum("nak,nk->na", effects, wavy.state.waves[tracks.image])
+    offset = residuals(wavy) - residuals(flat) - now
+    return replace(flat, tracks=flat.tracks._replace(effects=effects, offset=offset))
+
+
+def flattened(wavy: Problem, metric: Array, lens: Array) -> Problem:
+    """The problem without waves, at the same state, with the metric that it had before."""
+    none = np.zeros((0, 3, 0))
+    tracks = wavy.tracks._replace(waves=none, sight=np.zeros((0, 3)), metric=metric, lens=lens)
+    state = replace(wavy.state, waves=np.zeros((0, 0)))
+    return replace(wavy, tracks=tracks, state=state, wave_prior=None, level_prior=None)
+
+
+def images_with_waves(problem: Problem) -> NDArray[np.int64]:
+    """Images that have an interface and see points."""
+    seen = np.unique(problem.tracks.image)
+    return np.asarray(seen[problem.structure.image_plane[seen] >= 0], dtype=np.int64)
