@@ -38,7 +38,7 @@ LAYERS = [
     {"estimator.printed_terms"},
     {"estimator.adjustment"},
     {"estimator.soft_as_printed"},
-    {"refiner.observations", "refiner.alignment", "refiner.normal_equations", "refiner.report"},
+    {"refiner.observations", "refiner.alignment", "refiner.normal_equations", "refiner.report", "refiner.diagnosis"},
     {"refiner.start"},
     {"refiner.filtering", "refiner.uncertainty", "refiner.arrangement"},
     {"refiner.averaging"},

@@ -17,7 +17,8 @@ from colmap_refract.options import ImageNotes, RefinerRequest
 class Refiner:
     """Refine a COLMAP model that was photographed through a plane interface.
 
-    Writes a COLMAP model and, beside it, refraction.json with the interfaces.
+    Writes a COLMAP model and, beside it, refraction.json with the interfaces; with interface_shape soft
+    also a folder of surfaces, as height maps and meshes.
     """
 
     input_path: Path
@@ -44,6 +45,7 @@ class Refiner:
         from colmap_refract.files.model_io import read_model, write_model
         from colmap_refract.files.output import output_folder
         from colmap_refract.files.sidecar import SIDECAR_NAME, write_sidecar
+        from colmap_refract.files.surfaces import write_surfaces
         from colmap_refract.refiner.comparison import table
         from colmap_refract.refiner.report import report
         from colmap_refract.refiner.scenario_choice import choose_scenario
@@ -57,12 +59,13 @@ class Refiner:
             )
             comparison = None
             with ProgressLine() as line:
-                if self.options.scenario == "auto":
+                scenario = self.options.scenario
+                if scenario == "auto" or self.options.interface_shape == "auto":
                     comparison = choose_scenario(model, self.options, notes=notes, cameras=cameras, watch=line.show)
                     line.print(f"{table(comparison)}\n")
                     options = comparison.chosen.options
                 else:
-                    options = self.options.with_scenario(self.options.scenario)
+                    options = self.options.with_scenario(scenario)
                 if self.database_path is None:
                     from colmap_refract.refiner.refinement import refine
 
@@ -79,5 +82,6 @@ class Refiner:
                 result.sidecar.statistics["comparison"] = comparison.as_dict()
             write_model(result.reconstruction, folder)
             write_sidecar(result.sidecar, folder / SIDECAR_NAME)
+            write_surfaces(folder, result.reconstruction, result.sidecar)
         print(report(result.sidecar))
         print(f"\nWritten to {self.output_path}")

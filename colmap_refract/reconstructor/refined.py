@@ -11,6 +11,7 @@ from colmap_refract.errors import RefractError
 from colmap_refract.files.model_io import write_model
 from colmap_refract.files.output import WORK_PREFIX, output_folder
 from colmap_refract.files.sidecar import SIDECAR_NAME, Sidecar, read_sidecar, write_sidecar
+from colmap_refract.files.surfaces import write_surfaces
 from colmap_refract.options import ImageNotes, RefinerOptions
 from colmap_refract.reconstructor.contents import camera_key, fingerprint
 from colmap_refract.reconstructor.models import Model
@@ -81,6 +82,7 @@ def refine_model(
             result = _refine(workspace, database, model, options, complete_tracks, notes, cameras)
             write_model(result.reconstruction, folder)
             write_sidecar(result.sidecar, folder / SIDECAR_NAME)
+            write_surfaces(folder, result.reconstruction, result.sidecar)
             # Noted before the folder changes hands, so that neither the old nor the new one is taken for a stranger's.
             new = fingerprint(folder)
             record.begin(REFINEMENT, inputs)

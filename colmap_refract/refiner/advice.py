@@ -11,6 +11,7 @@ from colmap_refract.estimator.adjustment import Adjustment
 from colmap_refract.estimator.chunk import Problem
 from colmap_refract.interface import Array
 from colmap_refract.refiner.arrangement import Arrangement
+from colmap_refract.refiner.diagnosis import SpatialCorrelation
 from colmap_refract.refiner.filtering import label_wet
 from colmap_refract.refiner.uncertainty import Uncertainty
 
@@ -22,6 +23,8 @@ _STUCK = 1e-2
 """Of the cost: with as much still to be gained, a solver that takes no more steps is stuck."""
 _NARROW_VIEW_DEG = 20.0
 _OBLIQUE_DEG = 8.0
+_CORRELATED = 0.1
+"""Of neighbouring errors: a hundredth of the variance is not worth a word."""
 _WORSE, _AS_WELL = 1.02, 1 / 1.02
 """Times the median error without refraction: noise and another loss make less of a difference."""
 
@@ -38,6 +41,7 @@ class Facts:
     pinhole_errors: Array
     calibrated: bool
     errors: Array
+    correlation: SpatialCorrelation | None = None
 
 
 def has_converged(adjustment: Adjustment, uncertainty: Uncertainty) -> bool:
@@ -47,7 +51,27 @@ def has_converged(adjustment: Adjustment, uncertainty: Uncertainty) -> bool:
 
 def advise(facts: Facts) -> list[str]:
     """Sentences for the user, the gravest first; none where all is well."""
-    return [*_solver(facts), *_images(facts), *_planes(facts), *_index(facts), *_water(facts)]
+    return [*_solver(facts), *_images(facts), *_planes(facts), *_index(facts), *_water(facts), *_waves(facts)]
+
+
+def _waves(facts: Facts) -> list[str]:
+    """If neighbouring residuals agree, something with a shape is not in the model: in open water, waves."""
+    found = facts.correlation
+    if found is None or not found.significant or found.value < _CORRELATED:
+        return []
+    shape = (
+        f"The errors of neighbouring keypoints agree (correlation {found.value:.2f}, "
+        f"{found.deviation_px:.2g} px; noise alone gives 0): "
+    )
+    if facts.problem.num_waves or facts.problem.tracks.effects.shape[2]:
+        return [shape + "the surface has shapes that its modes cannot take; try more --num_wave_modes."]
+    options = facts.arrangement.options
+    if options.scenario == "camera_housing" or any(options.layer_thickness):
+        return [shape + "the intrinsics, the glass or the scenario do not fit the images."]
+    return [
+        f"{shape}the surface is not flat, or the scenario is another one. With --interface_shape soft about "
+        f"{found.uncorrelated_px:.2g} px would be left."
+    ]
 
 
 def advise_on_input(facts: Facts) -> list[str]:

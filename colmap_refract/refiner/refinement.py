@@ -30,9 +30,11 @@ from colmap_refract.refiner.continuation import (
     is_sound,
     label_by_fit,
     named,
+    residuals,
     spread_out,
     view_deg,
 )
+from colmap_refract.refiner.diagnosis import spatial_correlation
 from colmap_refract.refiner.filtering import label_wet, pinhole_errors, reprojection_errors
 from colmap_refract.refiner.observations import read_observations
 from colmap_refract.refiner.outcome import make_sidecar, output_frame, statistics, write_back
@@ -170,6 +172,8 @@ def refine(
     arrangement, _ = selection.active()
     errors = reprojection_errors(problem, arrangement.observations)
     noise = estimate_noise(problem) if soft is None else soft.statistics.noise
+    active = arrangement.observations
+    correlation = spatial_correlation(active.image, active.pixel, residuals(problem if soft is None else soft.solved))
     facts = Facts(
         arrangement=arrangement,
         problem=problem,
@@ -179,6 +183,7 @@ def refine(
         pinhole_errors=before,
         calibrated=bool(cameras),
         errors=errors,
+        correlation=correlation,
     )
     # A model that comes from a refinement says nothing of its input any more.
     about_input = [*remarks, *advise_on_input(facts)] if earlier is None else earlier.solver.get("input_warnings", [])
@@ -188,6 +193,9 @@ def refine(
     write_back(model, arrangement, problem, errors, to_output, stays)
     sidecar = make_sidecar(arrangement, notes, problem, adjustment, uncertainty, noise, to_output, warnings)
     sidecar.solver["input_warnings"] = about_input
+    if correlation is not None:
+        sidecar.statistics["spatial_correlation"] = correlation.value
+        sidecar.statistics["spatial_correlation_std"] = correlation.deviation
     if soft is not None:
         add_waves(sidecar, arrangement, soft, to_output.scale)
     seconds = (solve_seconds, perf_counter() - started)
@@ -332,7 +340,7 @@ def _solve_soft(
         soft = go_on(begin, everywhere, keep, soft, settings, watch)
     problem = soft.wavy.problem
     if not is_sound(problem):
-        _raise_unsound(problem, options)
+        raise Unsupported("Waves are not determined: with them the interface runs away from between cameras and points")
     return Selection(arrangement=arrangement, problem=begin, keep=keep, marks=marks), soft
 
 

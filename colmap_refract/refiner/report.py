@@ -24,6 +24,7 @@ def report(sidecar: Sidecar) -> str:
     lines = [_rule(), f"Refractive refinement, {sidecar.scenario}", _rule()]
     lines += _model(sidecar)
     lines += ["", *_interfaces(sidecar)]
+    lines += _waves(sidecar)
     lines += ["", *_solver(sidecar.solver)]
     warnings = sidecar.solver.get("warnings") or []
     if warnings:
@@ -114,6 +115,26 @@ def _interfaces(sidecar: Sidecar) -> list[str]:
         lines.append(_row("Walls", media))
     if metric:
         lines.append(_row("Size", "metres, from interface_distance" + _scale_worth(sidecar)))
+    return lines
+
+
+def _waves(sidecar: Sidecar) -> list[str]:
+    waves = sidecar.statistics.get("waves")
+    if not waves:
+        return []
+    unit = "m" if sidecar.units.get("distance") == "metre" else "model units"
+    lines = [
+        _row("Waves, slope (rms)", f"{_number(waves.get('slope_deviation_deg'))} deg"),
+        _row("Waves, dominant wavelength", f"about {_number(waves.get('wavelength'), 2)} {unit}"),
+        _row("Slopes that the surfaces take", f"{100 * waves.get('explained', 0.0):.4g} % of their variance"),
+    ]
+    if "level_tilt_deg" in waves:
+        lines.append(
+            _row(
+                "Planes about the mean level",
+                f"tilt {_number(waves['level_tilt_deg'])} deg, height {_number(waves.get('level_lift'))} {unit} (1 sigma)",
+            )
+        )
     return lines
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from colmap_refract.errors import RefractError
 from colmap_refract.estimator.scenario import share_planes
 from colmap_refract.interface import Array
-from colmap_refract.options import ImageNotes, RefinerOptions, RefinerRequest, Scenario
+from colmap_refract.options import ImageNotes, InterfaceShape, RefinerOptions, RefinerRequest, Scenario
 from colmap_refract.refiner.arrangement import one_pose_for_all
 from colmap_refract.refiner.comparison import Candidate, Comparison, compare
 from colmap_refract.refiner.continuation import Watch
@@ -34,11 +35,12 @@ def choose_scenario(
     cameras: Mapping[int, pycolmap.Camera] | None = None,
     watch: Watch | None = None,
 ) -> Comparison:
-    """Find the scenario of a capture: the simplest that predicts held-out observations as well as any.
+    """Find scenario and shape of a capture: the simplest that predict held-out observations as well as any.
 
     Args:
         reconstruction: a COLMAP model that ignored refraction; not altered.
-        request: of the refinement; its scenario says nothing, its `random_seed` is that of what is held out.
+        request: of the refinement; of its scenario and interface_shape what is `auto` is chosen, and its
+            `random_seed` is that of what is held out.
         notes, cameras: as for `refine`.
         watch: called as by `refine`, with the number and the name of the scenario before the stage's.
 
@@ -50,7 +52,8 @@ def choose_scenario(
             observation can be spared.
         KeyboardInterrupt: Ctrl-C during a solve; nothing has been changed.
     """
-    candidates = scenario_candidates(reconstruction, request, notes)
+    named = None if request.scenario == "auto" else (request.scenario,)
+    candidates = scenario_candidates(reconstruction, request, notes, named)
     return compare(reconstruction, candidates, notes=notes, cameras=cameras, seed=request.random_seed, watch=watch)
 
 
@@ -81,13 +84,29 @@ def scenario_candidates(
     observations = read_observations(reconstruction)
     if not len(observations.points):
         raise RefractError("the model has no point that two registered images see: there is nothing to refine")
+    num_images = len(observations.image_ids)
     found: dict[object, Candidate] = {}
     for scenario in possible_scenarios(observations) if scenarios is None else scenarios:
         options = request.with_scenario(scenario)
         tying, complexity = _tying(observations, options, notes or ImageNotes())
-        candidate = Candidate(label=scenario, options=options, complexity=complexity)
-        found.setdefault(tying, candidate)
+        for shape in _shapes(request, scenario):
+            # A surface for each image is less simple than any tying.
+            more = num_images * request.num_wave_modes if shape == "soft" else 0
+            candidate = Candidate(
+                label=scenario if request.interface_shape != "auto" else f"{scenario}, {shape}",
+                options=replace(options, interface_shape=shape),
+                complexity=complexity + more,
+            )
+            found.setdefault((tying, shape), candidate)
     return tuple(sorted(found.values(), key=lambda candidate: candidate.complexity))
+
+
+def _shapes(request: RefinerRequest, scenario: Scenario) -> tuple[InterfaceShape, ...]:
+    """The shapes of the interface to choose from: glass does not wave."""
+    if request.interface_shape != "auto":
+        return (request.interface_shape,)
+    waves = scenario != "camera_housing" and not any(request.layer_thickness)
+    return ("plane", "soft") if waves else ("plane",)
 
 
 def possible_scenarios(observations: Observations) -> tuple[Scenario, ...]:
