@@ -102,7 +102,7 @@ class Tracks(NamedTuple):
     def take(self, start: NDArray[np.int64], rows: NDArray[Any]) -> Tracks:
         """Some of the observations: `rows`, indices or a mask (N,), of points that begin at `start`."""
         # What nobody needs is empty, whatever the number of observations.
-        return Tracks(start, *(part[rows] if part.shape[0] else part for part in self[1:]))
+        return Tracks(start, *(part[rows] if part.shape[0] else part for part in self[1:]))  # type: ignore[arg-type]
 
 
 class Views(NamedTuple):
@@ -766,7 +766,7 @@ def residuals(points, tracks, views, optics, out):
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def surface_effects(points, tracks, views, optics, out):
-    """Pixels (N, 2, 3) per relative height and per slope of the surface under each keypoint, into `out`; with waves only."""
+    """Pixels (N, 2, 3) by relative height and by slopes of the surface under each keypoint; with waves only."""
     values = np.empty(VALUES)
     for p in range(points.shape[0]):
         for k in range(tracks.start[p], tracks.start[p + 1]):

@@ -86,7 +86,8 @@ def plane_stands(structure: Structure, state: State, block: int, image: int, pos
         return Standing(
             normal=normal, normal_by_pose=np.zeros((3, 6)), normal_by_plane=by_change,
             distance=distance + float(normal @ lever),
-            distance_by_pose=-normal @ center_by_pose, distance_by_plane=by_change.T @ lever + np.array([0.0, 0.0, 1.0]),
+            distance_by_pose=-normal @ center_by_pose,
+            distance_by_plane=by_change.T @ lever + np.array([0.0, 0.0, 1.0]),
             center=center, center_by_pose=center_by_pose,
         )  # fmt: skip
     in_rig = sensor.T @ normal
@@ -106,8 +107,8 @@ def compare_to_level(standing: Standing, level: LevelPlane, change: Array) -> tu
     solver could rid itself by turning the world, which no keypoint minds.
 
     Returns:
-        `(deviation, by_pose, by_plane, by_level)`, (4,), (4, 6), (4, 3), (4, 3); the last deviation is not a number where
-        the camera is behind a plane.
+        `(deviation, by_pose, by_plane, by_level)`, (4,), (4, 6), (4, 3), (4, 3); the last deviation is not a number
+        where the camera is behind a plane.
     """
     plane, turned = level.moved(change)
     lever = level.anchor - standing.center

@@ -79,16 +79,15 @@ def on_reference_rays(problem: Problem, reference: int, *, min_num_points: int) 
     layers = problem.layers.with_index(problem.state.index)
     origin, ray = refracted_rays(tracks, problem.structure, problem.state, layers)
     of_reference = of_reference[np.isfinite(origin + ray)[of_reference].all(axis=1)]
-    bound, first = np.unique(point[of_reference], return_index=True)
-    others = np.flatnonzero(~from_reference & np.isin(point, bound))
+    seen, first = np.unique(point[of_reference], return_index=True)
+    others = np.flatnonzero(~from_reference & np.isin(point, seen))
     points = np.unique(point[others])
-    bound = np.isin(bound, points)
-    if bound.sum() < max(min_num_points, 1):
+    if len(points) < max(min_num_points, 1):
         raise RefractError(
-            f"the reference image sees {bound.sum()} points that other images see, its rays need {min_num_points}: "
+            f"the reference image sees {len(points)} points that other images see, its rays need {min_num_points}: "
             "choose a reference image that sees more"
         )
-    rows = np.concatenate([of_reference[first[bound]], others])
+    rows = np.concatenate([of_reference[first[np.isin(seen, points)]], others])
     # Stable, so that the reference's observation stays the first of its point.
     rows = rows[np.argsort(point[rows], kind="stable")]
     start = np.searchsorted(point[rows], [*points, len(problem.points)]).astype(np.int64)

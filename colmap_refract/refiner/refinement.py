@@ -323,7 +323,7 @@ def _solve_soft(
     else:
         begin = level_start(arrangement)
     everything = np.ones(len(begin.tracks.image), dtype=np.bool_)
-    soft = solve_soft(arrangement, begin, everything, wave_options(arrangement, begin), settings, watch)
+    soft = solve_soft(arrangement, begin, everything, wave_options(arrangement), settings, watch)
     everywhere, keep = soft.wavy.problem, everything
     marks = None
     for _ in range(_NUM_WAVE_FILTERS):
@@ -335,7 +335,7 @@ def _solve_soft(
         if changed <= _NEGLIGIBLE_CHANGE:
             break
         soft = go_on(begin, everywhere, keep, soft, settings, watch)
-        everywhere = settle_everywhere(begin, everywhere, keep, soft)
+        everywhere = settle_everywhere(begin, soft)
     if not keep.all() and len(soft.wavy.problem.tracks.image) != int(keep.sum()):
         soft = go_on(begin, everywhere, keep, soft, settings, watch)
     problem = soft.wavy.problem

@@ -129,12 +129,8 @@ def _waves(sidecar: Sidecar) -> list[str]:
         _row("Slopes that the surfaces take", f"{100 * waves.get('explained', 0.0):.4g} % of their variance"),
     ]
     if "level_tilt_deg" in waves:
-        lines.append(
-            _row(
-                "Planes about the mean level",
-                f"tilt {_number(waves['level_tilt_deg'])} deg, height {_number(waves.get('level_lift'))} {unit} (1 sigma)",
-            )
-        )
+        tilt, lift = _number(waves["level_tilt_deg"]), _number(waves.get("level_lift"))
+        lines.append(_row("Planes about the mean level", f"tilt {tilt} deg, height {lift} {unit} (1 sigma)"))
     return lines
 
 

@@ -14,10 +14,10 @@ from colmap_refract.estimator.chunk import LevelPrior, Problem
 from colmap_refract.interface import Array, plane_in_cam
 from colmap_refract.refiner.arrangement import Arrangement, select_tracks
 from colmap_refract.refiner.continuation import Watch, named, residuals, retriangulate
-from colmap_refract.refiner.filtering import Filtered, filter_observations, predicted_directions
+from colmap_refract.refiner.filtering import Filtered, filter_observations, in_cameras, predicted_directions
 from colmap_refract.refiner.start import image_depths, viewing_directions, world_plane
 from colmap_refract.refiner.wave_statistics import estimate_statistics, log_evidence
-from colmap_refract.refiner.waves import WaveStatistics, Wavy, frozen, with_waves
+from colmap_refract.refiner.waves import WaveStatistics, Wavy, frozen, spread_waves, surface_effects, with_waves
 
 logger = logging.getLogger(__name__)
 
@@ -34,11 +34,17 @@ _FIRST_NOISE = 0.5
 _SCALES = (0.5, 2.0)
 _MOST_SCALINGS = 4
 _JOINT_ITERATIONS, _FROZEN_ITERATIONS = 12, 15
-_NUM_STATISTICS = 2
+_NUM_STATISTICS = 6
+_STAYS = 0.15
+"""Relative change of the slope deviation that ends the search for it."""
+_MATTERS = 0.5
+"""Noise deviations: waves that move the keypoints by less are none."""
 _MOST_FROZEN = 4
 _SETTLED = 0.05
 """Change of the planes, over their own noise-free scale, that ends the last solves."""
 _LOSS_SCALE_IN_NOISE = 4.0
+_WIDE = 4.0
+"""Times the median residual: the scale of the loss of the first solves."""
 MIN_OBSERVATIONS = 15
 """Per image: fewer say nothing of a surface's shape."""
 
@@ -49,10 +55,19 @@ class Unsupported(Exception):
 
 @dataclass(frozen=True, kw_only=True)
 class WaveOptions:
-    """What the user says of the waves; lengths over the median interface distance, None: estimated."""
+    """What the user says of the waves; None: estimated.
+
+    Attributes:
+        slope_deviation: a tangent; tilt: radians; lift: over the interface distance.
+        wavelength: over the median interface distance, or
+        wavelength_in_depths: over the median depth: a model's size is known by its depth, not by its interface.
+        level_prior: whether there is one.
+        num_modes: per image.
+    """
 
     slope_deviation: float | None
     wavelength: float | None
+    wavelength_in_depths: float | None
     level_prior: bool
     tilt: float | None
     lift: float | None
@@ -102,21 +117,18 @@ def level_start(arrangement: Arrangement, ratio: float = _START_RATIO) -> Proble
     )
 
 
-def wave_options(arrangement: Arrangement, start: Problem) -> WaveOptions:
-    """What the user said of the waves, in units of the solve's start."""
+def wave_options(arrangement: Arrangement) -> WaveOptions:
+    """What the user said of the waves."""
     options = arrangement.options
-    wavelength = options.wavelength
-    if wavelength is not None:
-        typical = float(np.nanmedian(start.state.planes_in_cam(start.structure)[1]))
-        if options.interface_distance is not None:
-            wavelength /= options.interface_distance
-        else:
-            wavelength /= arrangement.unit * typical
+    wavelength, metric = options.wavelength, options.interface_distance
     slope, tilt = options.wave_slope_deg, options.level_tilt_deg
     return WaveOptions(
         slope_deviation=None if slope is None else float(np.tan(np.radians(slope))),
-        wavelength=wavelength,
-        level_prior=options.level_prior and options.scenario == "moving_interface" and start.structure.num_planes > 1,
+        wavelength=wavelength / metric if wavelength is not None and metric is not None else None,
+        wavelength_in_depths=None if wavelength is None or metric is not None else wavelength / arrangement.unit,
+        level_prior=options.level_prior
+        and options.scenario == "moving_interface"
+        and arrangement.structure.num_planes > 1,
         tilt=None if tilt is None else float(np.radians(tilt)),
         lift=options.level_lift,
         num_modes=options.num_wave_modes,
@@ -145,13 +157,19 @@ class _Solver:
         *,
         stage: str,
         joint: bool,
-        loss: str = "cauchy",
+        wide: bool = False,
         iterations: int | None = None,
     ) -> tuple[Wavy, Adjustment, Problem]:
         """One round: the design at the current solution, and a solve."""
+        if self.options.wavelength_in_depths is not None:
+            length = self.options.wavelength_in_depths / _distance_in_depths(self.flat if current is None else current)
+            statistics = replace(statistics, wavelength=length)
         wavy = with_waves(self.flat, statistics, num_modes, current)
         scale = _LOSS_SCALE_IN_NOISE * statistics.noise
-        problem = replace(wavy.problem, level_prior=level, loss=loss, loss_scale=scale)  # type: ignore[arg-type]
+        if wide:
+            # Before waves are known, all residuals are large; wrong matches are larger.
+            scale = max(scale, _WIDE * float(np.median(np.abs(residuals(wavy.problem)))))
+        problem = replace(wavy.problem, level_prior=level, loss="cauchy", loss_scale=scale)
         count = iterations or (_JOINT_ITERATIONS if joint else _FROZEN_ITERATIONS)
         quick = replace(
             self.settings,
@@ -194,30 +212,35 @@ def solve_soft(
     current: Problem | None = None
     for num_modes in _FIRST_MODES:
         wavy, *_ = solver.solve(
-            current, statistics, level, min(num_modes, options.num_modes), stage="Waves", joint=True, loss="huber"
+            current, statistics, level, min(num_modes, options.num_modes), stage="Waves", joint=True, wide=True
         )
         current = wavy.problem
         if num_modes != _FIRST_MODES[0]:
             statistics, level = _updated(wavy, statistics, options)
     assert current is not None
-    if options.wavelength is None:
+    if options.wavelength is None and options.wavelength_in_depths is None:
         statistics, current = _choose_wavelength(solver, current, statistics, level, options)
     for _ in range(_NUM_STATISTICS):
         wavy, *_ = solver.solve(current, statistics, level, statistics_modes, stage="Wave statistics", joint=True)
         current = wavy.problem
         before = statistics
         statistics, level = _updated(wavy, statistics, options)
-        if abs(np.log(statistics.slope_deviation / before.slope_deviation)) < 0.1:
+        if abs(np.log(statistics.slope_deviation / before.slope_deviation)) < _STAYS:
             break
-    whole = _Solver(_part(start, keep), options, settings, watch)
-    moved = replace(whole.flat, state=replace(current.state, waves=np.zeros((0, 0))))
-    moved = retriangulate(replace(moved, loss="cauchy", loss_scale=20.0))
-    # The few tell the surface; all others are looked up on it once their own points are settled.
+    if _effect(wavy.problem) < _MATTERS * statistics.noise:
+        raise Unsupported("The surface shows no waves")
     wavy, *_ = solver.solve(current, statistics, level, options.num_modes, stage="Waves", joint=False)
-    if not few[keep].all():
-        begin = replace(whole.flat, state=replace(wavy.problem.state, waves=np.zeros((0, 0))), points=moved.points)
-        wavy, *_ = whole.solve(begin, statistics, level, options.num_modes, stage="Waves", joint=True)
-    return _frozen_rounds(whole, wavy.problem, statistics, level)
+    if few[keep].all():
+        return _frozen_rounds(solver, wavy.problem, statistics, level)
+    whole = _Solver(_part(start, keep), options, settings, watch)
+    return _frozen_rounds(whole, spread_waves(wavy, whole.flat), statistics, level)
+
+
+def _effect(problem: Problem) -> float:
+    """How far the waves move a keypoint, px: root mean square of what the surfaces do at the solution."""
+    effects = np.einsum("nak,nk->na", surface_effects(problem) @ problem.tracks.waves,
+                        problem.state.waves[problem.tracks.image])  # fmt: skip
+    return float(np.sqrt((effects**2).mean()))
 
 
 def _frozen_rounds(
@@ -253,26 +276,19 @@ def go_on(
         settings, watch: as for `solve_soft`.
     """
     options = WaveOptions(
-        slope_deviation=None, wavelength=None, level_prior=soft.level is not None, tilt=None, lift=None,
-        num_modes=soft.wavy.problem.num_waves,
+        slope_deviation=None, wavelength=None, wavelength_in_depths=None, level_prior=soft.level is not None, tilt=None,
+        lift=None, num_modes=soft.wavy.problem.num_waves,
     )  # fmt: skip
     solver = _Solver(_part(start, keep), options, settings, watch)
     return _frozen_rounds(solver, _part(everywhere, keep), soft.statistics, soft.level)
 
 
-def settle_everywhere(start: Problem, everywhere: Problem, keep: NDArray[np.bool_], soft: SoftSolution) -> Problem:
-    """All observations at a solution of some: points that took no part go where their rays now meet."""
+def settle_everywhere(start: Problem, soft: SoftSolution) -> Problem:
+    """All observations at a solution of some, weighted as those are."""
     solved = soft.wavy.problem
-    points = everywhere.points.copy()
-    counts = np.add.reduceat(keep.astype(np.int64), start.tracks.start[:-1])
-    points[counts >= 2] = solved.points
-    moved = replace(everywhere, state=replace(solved.state, waves=everywhere.state.waves), points=points)
-    wavy = with_waves(
-        replace(start, held=solved.held, wave_prior=None, level_prior=None),
-        soft.statistics,
-        solved.num_waves,
-        moved,
-    )
+    flat = replace(start, held=solved.held, wave_prior=None, level_prior=None)
+    spread = spread_waves(soft.wavy, flat)
+    wavy = with_waves(flat, soft.statistics, solved.num_waves, spread)
     return replace(wavy.problem, loss=solved.loss, loss_scale=solved.loss_scale)
 
 
@@ -323,6 +339,13 @@ def _first_guess(flat: Problem, options: WaveOptions) -> tuple[WaveStatistics, L
     tilt = options.tilt if options.tilt is not None else float(_FIRST_TILT)
     lift = options.lift if options.lift is not None else _FIRST_LIFT
     return statistics, LevelPrior(tilt=tilt, lift=lift, noise=_FIRST_NOISE)
+
+
+def _distance_in_depths(problem: Problem) -> float:
+    """Median distance of the interfaces over the median depth of the points."""
+    points, *_ = in_cameras(problem)
+    _, distance = problem.state.planes_in_cam(problem.structure)
+    return float(np.nanmedian(distance) / np.median(points[:, 2]))
 
 
 def _width(flat: Problem) -> float:

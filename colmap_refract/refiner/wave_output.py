@@ -43,9 +43,10 @@ def add_waves(sidecar: Sidecar, arrangement: Arrangement, soft: SoftSolution, sc
         )
         sidecar.images[name] = replace(sidecar.images[name], surface=surface.scaled(scale * float(distance[i])))
     typical = scale * float(np.nanmedian(distance))
+    given = arrangement.options
     waves = {
         "slope_deviation_deg": float(np.degrees(np.arctan(statistics.slope_deviation))),
-        "wavelength": statistics.wavelength * typical,
+        "wavelength": given.wavelength if given.wavelength is not None else statistics.wavelength * typical,
         "explained": soft.wavy.explained,
         "noise_px": statistics.noise,
     }

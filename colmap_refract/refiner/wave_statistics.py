@@ -23,7 +23,7 @@ _JITTER = 1e-9
 """Of the scaled diagonal: what the gauge leaves without curvature."""
 _LEAST_SLOPE, _MOST_SLOPE = np.tan(np.radians(0.02)), np.tan(np.radians(20.0))
 _LEAST_TILT, _LEAST_LIFT = np.radians(0.01), 1e-4
-_LARGEST_FACTOR = 3.0
+_LARGEST_FACTOR = 5.0
 """By which one update may change a deviation."""
 
 
@@ -120,6 +120,8 @@ def _scatter(problem: Problem, level: LevelPrior, found: Posterior, noise: float
         deviations.append(deviation)
         variances.append(noise**2 * np.einsum("ij,jk,ik->i", jacobian, found.covariance, jacobian))
     squared, variance = np.array(deviations) ** 2, np.array(variances)
+    if not np.isfinite(squared).all() or not np.isfinite(variance).all():
+        return level
     tilt = _deviation(squared[:, :2], variance[:, :2], level.tilt)
     lift = _deviation(squared[:, 2:], variance[:, 2:], level.lift)
     return replace(level, tilt=max(tilt, _LEAST_TILT), lift=max(lift, _LEAST_LIFT))

@@ -19,16 +19,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_refract.estimator import elimination
+from colmap_refract.estimator.adjustment import SolverSettings, settle_points
 from colmap_refract.estimator.chunk import Problem
 from colmap_refract.estimator.random_surface import Modes, RandomSurface, modes, node_grid
 from colmap_refract.estimator.scenario import Change, evaluate_views
 from colmap_refract.estimator.surface import local_planes
 from colmap_refract.interface import Array, tangent_basis
-from colmap_refract.refiner.continuation import residuals
+from colmap_refract.refiner.continuation import residuals, retriangulate
 from colmap_refract.refiner.filtering import predicted_directions
 
 _FIT = 1e-3
 """Of the slope deviation: how closely the coefficients follow the surface when its design changes."""
+_NUM_CROSSINGS = 3
+"""Rounds to find where a ray meets its surface: each brings a factor of the slope."""
+_WIDE_LOSS = 20.0
+"""Pixels."""
 _MOST_ADRIFT = 3.0
 """Noise deviations between keypoint and solution up to which the solution says where a ray meets the surface."""
 
@@ -122,6 +127,39 @@ def with_waves(flat: Problem, statistics: WaveStatistics, num_modes: int, curren
     return Wavy(problem=replace(wavy, tracks=whitened), modes=by_image, explained=float(1.0 - share.mean()))
 
 
+def spread_waves(wavy: Wavy, flat: Problem) -> Problem:
+    """The surfaces of a solution before other observations of the same images.
+
+    Args:
+        wavy: at its solution.
+        flat: the other observations, without waves; their points go where their rays meet behind the surfaces.
+    """
+    solution, tracks = wavy.problem, flat.tracks
+    normal, _ = solution.state.planes_in_cam(solution.structure)
+    waves = np.zeros((len(tracks.image), 3, solution.num_waves))
+    for image, shapes in enumerate(wavy.modes):
+        mine = np.flatnonzero(tracks.image == image)
+        if shapes is None or not len(mine):
+            continue
+        ray = tracks.direction[mine]
+        foot = (ray @ solution.structure.wave_axes[image]) / (ray @ normal[image])[:, None]
+        coefficients = solution.state.waves[image, : shapes.shapes.shape[1]]
+        places = foot
+        for _ in range(_NUM_CROSSINGS):
+            places = foot * (1.0 + shapes.at(places)[:, 0] @ coefficients)[:, None]
+        waves[mine, :, : len(coefficients)] = shapes.at(places) * np.array([1.0, -1.0, -1.0])[:, None]
+    spread = replace(
+        flat,
+        tracks=tracks._replace(waves=waves, sight=tracks.direction),
+        structure=solution.structure,
+        state=solution.state,
+        loss="cauchy",
+        loss_scale=_WIDE_LOSS,
+    )
+    spread = retriangulate(spread)
+    return replace(spread, points=settle_points(spread, SolverSettings()))
+
+
 def _sight(current: Problem, noise: float) -> Array:
     """Where a solution sees its points, or the keypoint where it does not see them near there (a wrong match)."""
     tracks = current.tracks
@@ -170,14 +208,6 @@ def frozen(wavy: Problem) -> Problem:
     now = np.einsum("nak,nk->na", effects, wavy.state.waves[tracks.image])
     offset = residuals(wavy) - residuals(flat) - now
     return replace(flat, tracks=flat.tracks._replace(effects=effects, offset=offset))
-
-
-def flattened(wavy: Problem, metric: Array, lens: Array) -> Problem:
-    """The problem without waves, at the same state, with the metric that it had before."""
-    none = np.zeros((0, 3, 0))
-    tracks = wavy.tracks._replace(waves=none, sight=np.zeros((0, 3)), metric=metric, lens=lens)
-    state = replace(wavy.state, waves=np.zeros((0, 0)))
-    return replace(wavy, tracks=tracks, state=state, wave_prior=None, level_prior=None)
 
 
 def images_with_waves(problem: Problem) -> NDArray[np.int64]:
