@@ -25,21 +25,23 @@ _START_RATIO = 0.4
 """Distance over depth of the level plane that a moving interface starts from; the outcome does not depend on it."""
 _FEW_OBSERVATIONS = 150
 """Per image, of the tracks that statistics and a first solution are found with."""
-_FIRST_MODES = (10, 16)
+_FIRST_MODES = (10, 16, 24)
 _STATISTICS_MODES = 24
 _FIRST_SLOPE, _FIRST_TILT, _FIRST_LIFT = np.tan(np.radians(2.0)), np.radians(2.0), 0.05
 _FIRST_WAVELENGTH = 2.0
 """Over the width of what an image sees of its surface."""
 _FIRST_NOISE = 0.5
 _SCALES = (0.5, 2.0)
-_MOST_SCALINGS = 4
-_JOINT_ITERATIONS, _FROZEN_ITERATIONS = 12, 15
+_MOST_SCALINGS = 2
+_JOINT_ITERATIONS, _FROZEN_ITERATIONS = 15, 30
+_FINE, _FINER = 1e-6, 1e-8
+"""Function tolerances while the waves are looked up anew, and of the last solves."""
 _NUM_STATISTICS = 6
 _STAYS = 0.15
 """Relative change of the slope deviation that ends the search for it."""
 _MATTERS = 0.5
 """Noise deviations: waves that move the keypoints by less are none."""
-_MOST_FROZEN = 4
+_MOST_FROZEN = 6
 _SETTLED = 0.05
 """Change of the planes, over their own noise-free scale, that ends the last solves."""
 _LOSS_SCALE_IN_NOISE = 4.0
@@ -174,7 +176,7 @@ class _Solver:
         quick = replace(
             self.settings,
             max_num_iterations=min(self.settings.max_num_iterations, count),
-            function_tolerance=max(self.settings.function_tolerance, 1e-6),
+            function_tolerance=max(self.settings.function_tolerance, _FINE if joint else _FINER),
         )
         joint = joint and not self.always_frozen
         posed = problem if joint else frozen(problem)
@@ -215,9 +217,9 @@ def solve_soft(
             current, statistics, level, min(num_modes, options.num_modes), stage="Waves", joint=True, wide=True
         )
         current = wavy.problem
-        if num_modes != _FIRST_MODES[0]:
-            statistics, level = _updated(wavy, statistics, options)
     assert current is not None
+    # Only now: statistics of a solution that is still far from its minimum would lead it astray.
+    statistics, level = _updated(wavy, statistics, options)
     if options.wavelength is None and options.wavelength_in_depths is None:
         statistics, current = _choose_wavelength(solver, current, statistics, level, options)
     for _ in range(_NUM_STATISTICS):
@@ -233,7 +235,10 @@ def solve_soft(
     if few[keep].all():
         return _frozen_rounds(solver, wavy.problem, statistics, level)
     whole = _Solver(_part(start, keep), options, settings, watch)
-    return _frozen_rounds(whole, spread_waves(wavy, whole.flat), statistics, level)
+    wavy, *_ = whole.solve(
+        spread_waves(wavy, whole.flat), statistics, level, options.num_modes, stage="Waves", joint=True
+    )
+    return _frozen_rounds(whole, wavy.problem, statistics, level)
 
 
 def _effect(problem: Problem) -> float:
@@ -379,13 +384,12 @@ def _choose_wavelength(
 ) -> tuple[WaveStatistics, Problem]:
     """The wavelength, up to a factor of two, that makes the data most probable."""
     tried: dict[float, tuple[float, Problem]] = {}
+    num_modes = min(_STATISTICS_MODES, options.num_modes)
 
     def judge(wavelength: float) -> float:
         if wavelength not in tried:
             changed = replace(statistics, wavelength=wavelength)
-            wavy, *_ = solver.solve(
-                current, changed, level, _FIRST_MODES[-1], stage="Wavelength", joint=True, iterations=6
-            )
+            wavy, *_ = solver.solve(current, changed, level, num_modes, stage="Wavelength", joint=True, iterations=6)
             whitening = np.linalg.norm(wavy.problem.tracks.metric, axis=(1, 2))
             before = np.linalg.norm(solver.flat.tracks.metric, axis=(1, 2))
             log_whitening = 2.0 * float(np.log(whitening / before).sum())
