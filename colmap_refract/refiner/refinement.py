@@ -75,6 +75,8 @@ _FINE = 1e-6
 _FINER = 1e-2
 """Tolerance of each further solve over that of the last, where more than that is left."""
 _NUM_WAVE_FILTERS = 3
+_LEAST_KEPT = 0.5
+"""Part of the observations without which a solution with waves is none."""
 _NEGLIGIBLE_CHANGE = 1e-3
 """Part of the observations whose removal or relabelling is not worth another solve."""
 
@@ -327,11 +329,13 @@ def _solve_soft(
     everywhere, keep = soft.wavy.problem, everything
     marks = None
     for _ in range(_NUM_WAVE_FILTERS):
-        marks = filter_waves(arrangement, everywhere)
+        marks = filter_waves(arrangement, everywhere, soft.statistics.noise)
         counts = np.add.reduceat(marks.keep.astype(np.int64), begin.tracks.start[:-1])
         remaining = marks.keep & np.repeat(counts >= 2, np.diff(begin.tracks.start))
         changed = float((remaining != keep).mean())
         keep = remaining
+        if keep.mean() < _LEAST_KEPT:
+            raise Unsupported("Waves are not determined: with them most observations are far off")
         if changed <= _NEGLIGIBLE_CHANGE:
             break
         soft = go_on(begin, everywhere, keep, soft, settings, watch)

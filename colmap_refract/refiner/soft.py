@@ -181,6 +181,9 @@ class _Solver:
         joint = joint and not self.always_frozen
         posed = problem if joint else frozen(problem)
         adjustment = adjust(posed, quick, on_progress=named(self.watch, stage))
+        finite = np.isfinite(adjustment.state.distance).all() and np.isfinite(adjustment.points).all()
+        if adjustment.termination == "failure" or not finite:
+            raise Unsupported("Waves are not determined: the solver failed with them")
         found = {"state": adjustment.state, "points": adjustment.points}
         return replace(wavy, problem=replace(problem, **found)), adjustment, replace(posed, **found)  # type: ignore[arg-type]
 
@@ -297,11 +300,11 @@ def settle_everywhere(start: Problem, soft: SoftSolution) -> Problem:
     return replace(wavy.problem, loss=solved.loss, loss_scale=solved.loss_scale)
 
 
-def filter_waves(arrangement: Arrangement, problem: Problem) -> Filtered:
+def filter_waves(arrangement: Arrangement, problem: Problem, noise: float) -> Filtered:
     """Mark what to remove at a solution with waves.
 
     Where slopes are left that the surface cannot take, an error counts less: what is compared with the limit is the
-    error over what the waves add to the keypoint's own noise.
+    error over what the waves add to the keypoint's own noise (px). Where that is large, so is the limit.
     """
     options = arrangement.options
     angles = filter_observations(
@@ -309,7 +312,8 @@ def filter_waves(arrangement: Arrangement, problem: Problem) -> Filtered:
     )
     large = np.zeros(len(problem.tracks.image), dtype=np.bool_)
     if options.filter_max_reproj_error > 0:
-        large = np.linalg.norm(residuals(problem), axis=1) > options.filter_max_reproj_error
+        limit = max(options.filter_max_reproj_error, _LOSS_SCALE_IN_NOISE * noise)
+        large = np.linalg.norm(residuals(problem), axis=1) > limit
     return Filtered(keep=angles.keep & ~large, num_large_error=int(large.sum()), num_small_angle=angles.num_small_angle)
 
 

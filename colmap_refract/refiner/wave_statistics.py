@@ -23,7 +23,7 @@ _JITTER = 1e-9
 """Of the scaled diagonal: what the gauge leaves without curvature."""
 _LEAST_SLOPE, _MOST_SLOPE = np.tan(np.radians(0.02)), np.tan(np.radians(20.0))
 _LEAST_TILT, _LEAST_LIFT = np.radians(0.01), 1e-4
-_LARGEST_FACTOR = 5.0
+_LARGEST_FACTOR = 3.0
 """By which one update may change a deviation."""
 
 
