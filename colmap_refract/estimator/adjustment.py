@@ -27,6 +27,8 @@ from colmap_refract.interface import Array
 
 logger = logging.getLogger(__name__)
 
+Termination = Literal["convergence", "no_convergence", "failure"]
+
 _JITTER = 1e-12
 """Of the scaled matrix's unit diagonal: the gauge leaves seven directions without any curvature."""
 
@@ -78,7 +80,7 @@ class Adjustment:
     cost: float
     initial_cost: float
     num_iterations: int
-    termination: Literal["convergence", "no_convergence", "failure"]
+    termination: Termination
     message: str
     gradient_max_norm: float
     seconds: float
@@ -314,18 +316,9 @@ def _solve(
         fixed = ([0, 1] if problem.held.normals[key[1]] else []) + ([2] if problem.held.distances[key[1]] else [])
         if fixed:
             ceres.set_manifold(blocks.values[key], pyceres.SubsetManifold(3, fixed))
-    options = pyceres.SolverOptions()
-    options.linear_solver_type = pyceres.LinearSolverType.SPARSE_NORMAL_CHOLESKY
+    options = solver_options(settings)
     if len(chunks) == 1:
         options.linear_solver_type = pyceres.LinearSolverType.DENSE_NORMAL_CHOLESKY
-    options.max_num_iterations = settings.max_num_iterations
-    options.function_tolerance = settings.function_tolerance
-    options.gradient_tolerance = settings.gradient_tolerance
-    options.parameter_tolerance = settings.parameter_tolerance
-    options.initial_trust_region_radius = settings.initial_trust_region_radius
-    options.max_num_consecutive_invalid_steps = 20
-    options.num_threads = settings.num_threads
-    options.logging_type = pyceres.LoggingType.SILENT
     callback = _Callback(watch)
     options.callbacks = [callback]
     summary = pyceres.SolverSummary()
@@ -334,23 +327,40 @@ def _solve(
         pyceres.solve(options, ceres, summary)
     if watch.exception is not None:
         raise watch.exception
-    kind = pyceres.TerminationType
-    termination: Literal["convergence", "no_convergence", "failure"] = "failure"
-    if summary.termination_type in (kind.CONVERGENCE, kind.USER_SUCCESS):
-        termination = "convergence"
-    elif summary.termination_type == kind.NO_CONVERGENCE:
-        termination = "no_convergence"
     return Adjustment(
         state=apply(problem.state, change_of(problem.state, blocks.values.items())),
         points=_settled(problem, chunks, blocks, pool),
         cost=float(summary.final_cost),
         initial_cost=float(summary.initial_cost),
         num_iterations=int(summary.num_successful_steps + summary.num_unsuccessful_steps),
-        termination=termination,
+        termination=termination_of(summary),
         message=str(summary.message),
         gradient_max_norm=watch.gradient_max_norm,
         seconds=float(summary.total_time_in_seconds),
     )
+
+
+def solver_options(settings: SolverSettings) -> Any:
+    """Ceres' options for the settings, with a sparse solver."""
+    options = pyceres.SolverOptions()
+    options.linear_solver_type = pyceres.LinearSolverType.SPARSE_NORMAL_CHOLESKY
+    options.max_num_iterations = settings.max_num_iterations
+    options.function_tolerance = settings.function_tolerance
+    options.gradient_tolerance = settings.gradient_tolerance
+    options.parameter_tolerance = settings.parameter_tolerance
+    options.initial_trust_region_radius = settings.initial_trust_region_radius
+    options.max_num_consecutive_invalid_steps = 20
+    options.num_threads = settings.num_threads
+    options.logging_type = pyceres.LoggingType.SILENT
+    return options
+
+
+def termination_of(summary: Any) -> Termination:
+    """Why Ceres stopped."""
+    kind = pyceres.TerminationType
+    if summary.termination_type in (kind.CONVERGENCE, kind.USER_SUCCESS):
+        return "convergence"
+    return "no_convergence" if summary.termination_type == kind.NO_CONVERGENCE else "failure"
 
 
 def _size_prior(translation: Array) -> Any:

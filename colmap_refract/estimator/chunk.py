@@ -15,7 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_refract.estimator import elimination
-from colmap_refract.estimator.elimination import LENS, MEDIUM, PLANE, POSE, WAVES, Anchors, Optics, Tracks
+from colmap_refract.estimator.elimination import (
+    LENS,
+    MEDIUM,
+    NUM_SLOTS,
+    PLANE,
+    POSE,
+    WAVES,
+    Anchors,
+    Optics,
+    Tracks,
+    Views,
+)
 from colmap_refract.estimator.optics import Media
 from colmap_refract.estimator.scenario import Change, State, Structure, evaluate_views
 from colmap_refract.interface import Array, Layers
@@ -115,6 +126,12 @@ class Problem:
         return int(self.state.waves.shape[1])
 
     @property
+    def views(self) -> Views:
+        """The images at the state, for compiled code, with nothing free."""
+        columns = np.full((self.structure.num_images, NUM_SLOTS), -1, dtype=np.int32)
+        return evaluate_views(self.structure, self.state, Change.zero(self.state), columns)
+
+    @property
     def optics(self) -> Optics:
         """The media at the state's index, for compiled code."""
         return _optics(self.layers, self.state.index)
@@ -210,7 +227,7 @@ class Chunk:
         self.widths = [slot_width(slot, state) for slot, _ in self.keys]
         self.first_column = dict(zip(self.keys, np.concatenate([[0], np.cumsum(self.widths)]).tolist(), strict=False))
         self.num_columns = int(sum(self.widths))
-        self.columns = np.full((len(images), 5), -1, dtype=np.int32)
+        self.columns = np.full((len(images), NUM_SLOTS), -1, dtype=np.int32)
         for row, image in enumerate(images):
             for key in _image_blocks(problem, int(image)):
                 self.columns[row, key[0]] = self.first_column[key]

@@ -45,7 +45,8 @@ from colmap_refract.estimator.optics import FAST, one_interface, slope_derivativ
 from colmap_refract.estimator.scene_residual import observe_in_scene
 from colmap_refract.interface import Array
 
-POSE, PLANE, MEDIUM, LENS, WAVES = range(5)
+NUM_SLOTS = 5
+POSE, PLANE, MEDIUM, LENS, WAVES = range(NUM_SLOTS)
 """The slots of an image."""
 
 LEVEL = 5
@@ -627,14 +628,14 @@ def reduce(
     for p in range(first_track, stop_track):
         longest = max(longest, tracks.start[p + 1] - tracks.start[p])
     values = np.empty(VALUES)
-    by_blocks = np.empty((5, 2, most))
+    by_blocks = np.empty((NUM_SLOTS, 2, most))
     v = np.empty(6)
     point_gradient = np.empty(3)
     lower = np.empty(6)
     # The blocks that the current point touches, and where a column's block stands among them.
-    touched_column = np.empty(5 * longest, dtype=np.int64)
-    touched_width = np.empty(5 * longest, dtype=np.int64)
-    coupling = np.empty((5 * longest, 3, most))
+    touched_column = np.empty(NUM_SLOTS * longest, dtype=np.int64)
+    touched_width = np.empty(NUM_SLOTS * longest, dtype=np.int64)
+    coupling = np.empty((NUM_SLOTS * longest, 3, most))
     place = np.full(gradient.shape[0], -1, dtype=np.int64)
     in_scene = tracks.scene.shape[0] > 0
     origin, ray, by_point = np.empty(3), np.empty(3), np.empty((2, 3))
@@ -671,7 +672,7 @@ def reduce(
             point_gradient[1] += weight * (e0 * b01 + e1 * b11)
             point_gradient[2] += weight * (e0 * b02 + e1 * b12)
             _by_blocks(k, values, tracks, views, widths, by_blocks)
-            for slot in range(5):
+            for slot in range(NUM_SLOTS):
                 column = views.columns[i, slot]
                 if column < 0:
                     continue
@@ -694,7 +695,7 @@ def reduce(
                     coupling[at, 1, j] += a0 * b01 + a1 * b11
                     coupling[at, 2, j] += a0 * b02 + a1 * b12
                     gradient[column + j] += a0 * e0 + a1 * e1
-                for other in range(5):
+                for other in range(NUM_SLOTS):
                     other_column = views.columns[i, other]
                     if other_column < column:
                         continue
@@ -712,7 +713,7 @@ def reduce(
         if on_rays and not hold_points:
             _constraint(first, points[p], tracks, views, optics, widths, values, by_point, by_blocks)
             refracted_ray(first, tracks, views, optics, origin, ray)
-            for slot in range(5):
+            for slot in range(NUM_SLOTS):
                 column = views.columns[tracks.image[first], slot]
                 place_of_slot[slot] = -1
                 if column < 0:

@@ -10,12 +10,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_refract.estimator.chunk import Problem
 from colmap_refract.estimator.elimination import LEVEL, PLANE, POSE, WAVES
 from colmap_refract.estimator.rotation import cross_matrix, exp_and_left_jacobian
-from colmap_refract.estimator.scenario import State, Structure
-from colmap_refract.interface import Array, tangent_basis
+from colmap_refract.estimator.scenario import State, Structure, turn_normals
+from colmap_refract.interface import Array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,13 +29,9 @@ class LevelPlane:
 
     def moved(self, change: Array) -> tuple[LevelPlane, Array]:
         """After a tangential change of the normal (2) and one of the distance; and the normal's derivative (3, 2)."""
-        basis = tangent_basis(self.normal)
-        moved = self.normal + basis @ change[:2]
-        length = float(np.linalg.norm(moved))
-        normal = moved / length
-        by_change = (basis - np.outer(normal, normal @ basis)) / length
-        plane = LevelPlane(normal=normal, distance=self.distance + float(change[2]), anchor=self.anchor)
-        return plane, by_change
+        normal, by_change = turn_normals(self.normal[None], change[None, :2])
+        plane = LevelPlane(normal=normal[0], distance=self.distance + float(change[2]), anchor=self.anchor)
+        return plane, by_change[0]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +54,7 @@ class Standing:
     center_by_pose: Array
 
 
-def first_images(structure: Structure) -> Array:
+def first_images(structure: Structure) -> NDArray[np.int64]:
     """(B,) an image of each plane block."""
     return np.array(
         [np.flatnonzero(structure.image_plane == b)[0] for b in range(structure.num_planes)], dtype=np.int64
@@ -74,12 +71,8 @@ def plane_stands(structure: Structure, state: State, block: int, image: int, pos
     arm = -sensor.T @ shift
     center = rotation.T @ (arm - translation)
     center_by_pose = np.hstack([rotation.T @ cross_matrix((arm - pose[3:])[None])[0] @ left[0], -rotation.T])
-    basis = tangent_basis(state.normal[block])
-    moved = state.normal[block] + basis @ plane[:2]
-    length = np.linalg.norm(moved)
-    normal = moved / length
-    by_change = np.zeros((3, 3))
-    by_change[:, :2] = (basis - np.outer(normal, normal @ basis)) / length
+    (normal,), (turned,) = turn_normals(state.normal[block][None], plane[None, :2])
+    by_change = np.column_stack([turned, np.zeros(3)])
     distance = float(state.distance[block] + plane[2])
     if structure.plane_in_world[block]:
         lever = structure.plane_anchor[block] - center
@@ -166,12 +159,17 @@ class PriorBlock:
     evaluate: Callable[[Sequence[Array]], tuple[Array, list[Array]]]
 
 
+def images_with_waves(problem: Problem) -> NDArray[np.int64]:
+    """Images that have an interface and see points."""
+    seen = np.unique(problem.tracks.image)
+    return np.asarray(seen[problem.structure.image_plane[seen] >= 0], dtype=np.int64)
+
+
 def prior_blocks(problem: Problem) -> list[PriorBlock]:
     """The residual blocks that a problem's priors make."""
     blocks: list[PriorBlock] = []
     if problem.wave_prior is not None and not problem.held.waves:
-        seen = np.unique(problem.tracks.image)
-        for image in seen[problem.structure.image_plane[seen] >= 0].tolist():
+        for image in images_with_waves(problem).tolist():
             blocks.append(_about_waves(image, problem.wave_prior[image], problem.state.waves[image]))
     if problem.level_prior is not None:
         level = mean_plane(problem.structure, problem.state)

@@ -147,12 +147,12 @@ class Change:
         )
 
 
-def _turn_normals(state: State, change: Change) -> tuple[Array, Array]:
-    """Normals (B, 3) after a tangential change, and their derivative by it (B, 3, 2)."""
-    if not len(state.normal):
-        return state.normal, np.zeros((0, 3, 2))
-    basis = np.stack([tangent_basis(n) for n in state.normal])
-    moved = state.normal + np.einsum("bij,bj->bi", basis, change.plane[:, :2])
+def turn_normals(normals: Array, tangential: Array) -> tuple[Array, Array]:
+    """Unit normals (B, 3) after tangential changes (B, 2), and their derivative by them (B, 3, 2)."""
+    if not len(normals):
+        return normals, np.zeros((0, 3, 2))
+    basis = np.stack([tangent_basis(n) for n in normals])
+    moved = normals + np.einsum("bij,bj->bi", basis, tangential)
     norm = np.linalg.norm(moved, axis=1)
     normal = moved / norm[:, None]
     along = np.einsum("bi,bij->bj", normal, basis)
@@ -166,7 +166,7 @@ def apply(state: State, change: Change) -> State:
         state,
         rotation=turn @ state.rotation,
         translation=np.einsum("fij,fj->fi", turn, state.translation) + change.pose[:, 3:],
-        normal=_turn_normals(state, change)[0],
+        normal=turn_normals(state.normal, change.plane[:, :2])[0],
         distance=state.distance + change.plane[:, 2],
         index=state.index + change.index,
         lens=state.lens + change.lens,
@@ -203,7 +203,7 @@ def evaluate_views(structure: Structure, state: State, change: Change, columns: 
     if structure.num_planes:
         block = np.maximum(structure.image_plane, 0)
         in_world = structure.plane_in_world[block]
-        by_change = _turn_normals(state, change)[1][block]
+        by_change = turn_normals(state.normal, change.plane[:, :2])[1][block]
         plane_map[:, :3, :2] = np.where(in_world[:, None, None], rotation @ by_change, by_change)
         center = -np.einsum("nji,nj->ni", rotation, translation)
         lever = np.einsum("ni,nij->nj", structure.plane_anchor[block] - center, by_change)

@@ -33,7 +33,7 @@ import pyceres
 from threadpoolctl import threadpool_limits
 
 from colmap_refract.errors import RefractError
-from colmap_refract.estimator.adjustment import Progress, SolverSettings
+from colmap_refract.estimator.adjustment import Progress, SolverSettings, Termination, solver_options, termination_of
 from colmap_refract.estimator.chunk import Problem, robust_cost
 from colmap_refract.estimator.neighbours import neighbour_weights
 from colmap_refract.estimator.printed_terms import DistanceToRay, ImageViews, pixel_weights
@@ -55,12 +55,6 @@ from colmap_refract.options import Loss
 
 _MAX_TRUST_REGION_RADIUS = 1e10
 """Along the weak directions steps are good for long, and Ceres' radius grows until the factorisation fails."""
-
-_TERMINATIONS: dict[Any, Literal["convergence", "no_convergence", "failure"]] = {
-    pyceres.TerminationType.CONVERGENCE: "convergence",
-    pyceres.TerminationType.USER_SUCCESS: "convergence",
-    pyceres.TerminationType.NO_CONVERGENCE: "no_convergence",
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +80,7 @@ class PrintedAdjustment:
     data_cost: float
     smoothness_cost: float
     num_iterations: int
-    termination: Literal["convergence", "no_convergence", "failure"]
+    termination: Termination
     message: str
 
 
@@ -174,7 +168,7 @@ def adjust_as_printed(
         data_cost=data_cost,
         smoothness_cost=0.5 * smoothness * spread,
         num_iterations=int(summary.num_successful_steps + summary.num_unsuccessful_steps),
-        termination=_TERMINATIONS.get(summary.termination_type, "failure"),
+        termination=termination_of(summary),
         message=str(summary.message),
     )
 
@@ -256,17 +250,8 @@ def _solve(
     on_progress: Callable[[Progress], None] | None,
 ) -> Any:
     """Run Ceres on the blocks in place; its summary."""
-    options = pyceres.SolverOptions()
-    options.linear_solver_type = pyceres.LinearSolverType.SPARSE_NORMAL_CHOLESKY
-    options.max_num_iterations = settings.max_num_iterations
-    options.function_tolerance = settings.function_tolerance
-    options.gradient_tolerance = settings.gradient_tolerance
-    options.parameter_tolerance = settings.parameter_tolerance
-    options.initial_trust_region_radius = settings.initial_trust_region_radius
+    options = solver_options(settings)
     options.max_trust_region_radius = _MAX_TRUST_REGION_RADIUS
-    options.max_num_consecutive_invalid_steps = 20
-    options.num_threads = settings.num_threads
-    options.logging_type = pyceres.LoggingType.SILENT
     callback = _Callback(error, num_observations, on_progress)
     options.callbacks = [callback]
     summary = pyceres.SolverSummary()

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from colmap_refract.estimator import elimination
 from colmap_refract.estimator.adjustment import Adjustment, Progress, SolverSettings, adjust, settle_points
 from colmap_refract.estimator.chunk import Problem, robust_cost
-from colmap_refract.estimator.scenario import Change, evaluate_views
 from colmap_refract.estimator.triangulation import triangulate
 from colmap_refract.interface import Array
 from colmap_refract.options import Loss
@@ -380,12 +379,8 @@ def _widened(problem: Problem, loss: Loss = "cauchy") -> Problem:
 
 def residuals(problem: Problem) -> Array:
     """Residuals (N, 2) in px at the problem's state and points."""
-    views = evaluate_views(
-        problem.structure, problem.state, Change.zero(problem.state),
-        np.full((problem.structure.num_images, 5), -1, dtype=np.int32),
-    )  # fmt: skip
     out = np.empty((len(problem.tracks.image), 2))
-    elimination.residuals(problem.points, problem.tracks, views, problem.optics, out)
+    elimination.residuals(problem.points, problem.tracks, problem.views, problem.optics, out)
     return out
 
 

@@ -110,7 +110,7 @@ def filter_observations(
     )
 
 
-def noise(residuals: Array, num_unknowns: int) -> float:
+def noise(residuals: Array, num_unknowns: float) -> float:
     """Standard deviation, px, of one coordinate of a keypoint, from residuals (N, 2) after a fit; robust."""
     spread = 1.4826 * float(np.median(np.abs(residuals)))
     freedom = max(residuals.size - num_unknowns, 0.05 * residuals.size)

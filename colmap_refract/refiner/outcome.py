@@ -86,7 +86,19 @@ def write_back(
         model.frame(int(frame_id)).rig_from_world = moved
     for camera_id, camera in zip(observations.camera_ids, observations.cameras, strict=True):
         model.camera(int(camera_id)).params = list(camera.params)
-    kept_points = set(observations.point3D_ids.tolist())
+    keep_only(model, observations, stays)
+    points = to_output.points(problem.points)
+    mean_error = np.add.reduceat(errors, observations.start[:-1]) / np.diff(observations.start)
+    for point3D_id, xyz, error in zip(observations.point3D_ids.tolist(), points, mean_error, strict=True):
+        point = model.point3D(point3D_id)
+        if not arrangement.held.points:
+            point.xyz = xyz
+        point.error = float(error)
+
+
+def keep_only(model: pycolmap.Reconstruction, points: Observations, stays: Observations) -> None:
+    """Take out of the model the points that are not among `points`, and the observations that are not in `stays`."""
+    kept_points = set(points.point3D_ids.tolist())
     image_id = stays.image_ids[stays.image]
     kept = set(zip(image_id.tolist(), stays.point2D_idx.tolist(), strict=True))
     for point3D_id in list(model.point3D_ids()):
@@ -98,13 +110,6 @@ def write_back(
         for element in elements:
             if element not in kept:
                 model.delete_observation(*element)
-    points = to_output.points(problem.points)
-    mean_error = np.add.reduceat(errors, observations.start[:-1]) / np.diff(observations.start)
-    for point3D_id, xyz, error in zip(observations.point3D_ids.tolist(), points, mean_error, strict=True):
-        point = model.point3D(point3D_id)
-        if not arrangement.held.points:
-            point.xyz = xyz
-        point.error = float(error)
 
 
 def make_sidecar(

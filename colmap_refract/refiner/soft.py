@@ -43,7 +43,7 @@ _MATTERS = 0.5
 """Noise deviations: waves that move the keypoints by less are none."""
 _MOST_FROZEN = 6
 _SETTLED = 0.05
-"""Change of the planes, over their own noise-free scale, that ends the last solves."""
+"""Noise deviations by which predicted keypoints still move between the rounds that end the last solves."""
 _LOSS_SCALE_IN_NOISE = 4.0
 _WIDE = 4.0
 """Times the median residual: the scale of the loss of the first solves."""
@@ -373,7 +373,7 @@ def _width(flat: Problem) -> float:
 def _updated(wavy: Wavy, statistics: WaveStatistics, options: WaveOptions) -> tuple[WaveStatistics, LevelPrior | None]:
     given = options.slope_deviation is not None
     before = wavy.problem.level_prior
-    statistics, level = estimate_statistics(wavy.problem, statistics, given_slope=given, given_noise=False)
+    statistics, level = estimate_statistics(wavy.problem, statistics, given_slope=given)
     if level is not None and before is not None:
         level = replace(
             level,

@@ -13,16 +13,18 @@ from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from colmap_refract.estimator.chunk import LevelPrior, Problem
 from colmap_refract.estimator.elimination import LEVEL, PLANE, POSE, WAVES
-from colmap_refract.estimator.priors import compare_to_level, first_images, mean_plane, plane_stands
+from colmap_refract.estimator.priors import compare_to_level, first_images, images_with_waves, mean_plane, plane_stands
 from colmap_refract.interface import Array, tangent_basis
 from colmap_refract.refiner.continuation import residuals
+from colmap_refract.refiner.filtering import noise as noise_of
 from colmap_refract.refiner.normal_equations import NormalEquations, normal_equations
-from colmap_refract.refiner.waves import WaveStatistics, images_with_waves
+from colmap_refract.refiner.waves import WaveStatistics
 
 _JITTER = 1e-9
 """Of the scaled diagonal: what the gauge leaves without curvature."""
 _LEAST_SLOPE, _MOST_SLOPE = np.tan(np.radians(0.02)), np.tan(np.radians(20.0))
 _LEAST_TILT, _LEAST_LIFT = np.radians(0.01), 1e-4
+_LEAST_NOISE = 1e-6
 _LARGEST_FACTOR = 3.0
 """By which one update may change a deviation."""
 
@@ -57,14 +59,14 @@ def posterior(problem: Problem) -> Posterior | None:
 
 
 def estimate_statistics(
-    problem: Problem, statistics: WaveStatistics, *, given_slope: bool, given_noise: bool
+    problem: Problem, statistics: WaveStatistics, *, given_slope: bool
 ) -> tuple[WaveStatistics, LevelPrior | None]:
     """One update of slope deviation, noise and level prior at a solution with waves.
 
     Args:
         problem: at its solution.
         statistics: that it was solved with.
-        given_slope, given_noise: what stays as it is.
+        given_slope: whether the slope deviation stays as it is.
     """
     level = problem.level_prior
     found = posterior(problem)
@@ -84,22 +86,12 @@ def estimate_statistics(
     if not given_slope and determined > 1.0:
         factor = np.clip(np.sqrt(squared / determined), 1.0 / _LARGEST_FACTOR, _LARGEST_FACTOR)
         slope = float(np.clip(slope * factor, _LEAST_SLOPE, _MOST_SLOPE))
-    noise = statistics.noise
-    if not given_noise:
-        unknowns = 3 * len(problem.points) + determined
-        unknowns += sum(width for key, width in system.widths.items() if key[0] in (POSE, PLANE))
-        noise = _noise(problem, unknowns)
+    unknowns = 3 * len(problem.points) + determined
+    unknowns += sum(width for key, width in system.widths.items() if key[0] in (POSE, PLANE))
+    noise = max(noise_of(residuals(problem), unknowns), _LEAST_NOISE)
     if level is not None:
         level = _scatter(problem, replace(level, noise=noise), found, statistics.noise)
     return replace(statistics, slope_deviation=slope, noise=noise), level
-
-
-def _noise(problem: Problem, unknowns: float) -> float:
-    """Robust standard deviation, px, of a keypoint coordinate, from residuals of which some fit by themselves."""
-    error = residuals(problem)
-    spread = 1.4826 * float(np.median(np.abs(error)))
-    freedom = max(error.size - unknowns, 0.05 * error.size)
-    return max(spread * float(np.sqrt(error.size / freedom)), 1e-6)
 
 
 def _scatter(problem: Problem, level: LevelPrior, found: Posterior, noise: float) -> LevelPrior:

@@ -16,13 +16,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_refract.estimator import elimination
 from colmap_refract.estimator.adjustment import SolverSettings, settle_points
 from colmap_refract.estimator.chunk import Problem
 from colmap_refract.estimator.random_surface import Modes, RandomSurface, modes, node_grid
-from colmap_refract.estimator.scenario import Change, evaluate_views
 from colmap_refract.estimator.surface import local_planes
 from colmap_refract.interface import Array, tangent_basis
 from colmap_refract.refiner.continuation import residuals, retriangulate
@@ -191,12 +189,8 @@ def relief_of(problem: Problem, axes: Array) -> Array:
 
 def surface_effects(problem: Problem) -> Array:
     """Pixels (N, 2, 3) by height and slopes of the local surface, at the problem's waves."""
-    views = evaluate_views(
-        problem.structure, problem.state, Change.zero(problem.state),
-        np.full((problem.structure.num_images, 5), -1, dtype=np.int32),
-    )  # fmt: skip
     out = np.zeros((len(problem.tracks.image), 2, 3))
-    elimination.surface_effects(problem.points, problem.tracks, views, problem.optics, out)
+    elimination.surface_effects(problem.points, problem.tracks, problem.views, problem.optics, out)
     return out
 
 
@@ -208,9 +202,3 @@ def frozen(wavy: Problem) -> Problem:
     now = np.einsum("nak,nk->na", effects, wavy.state.waves[tracks.image])
     offset = residuals(wavy) - residuals(flat) - now
     return replace(flat, tracks=flat.tracks._replace(effects=effects, offset=offset))
-
-
-def images_with_waves(problem: Problem) -> NDArray[np.int64]:
-    """Images that have an interface and see points."""
-    seen = np.unique(problem.tracks.image)
-    return np.asarray(seen[problem.structure.image_plane[seen] >= 0], dtype=np.int64)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from colmap_refract.files.sidecar import ImageInterface, Sidecar
 from colmap_refract.interface import Array
 from colmap_refract.refiner.observations import Observations
+from colmap_refract.refiner.outcome import keep_only
 from colmap_refract.triangulator.options import TriangulatorOptions
 
 if TYPE_CHECKING:
@@ -145,18 +146,7 @@ def outcome(
 
 def _write_back(model: pycolmap.Reconstruction, observations: Observations, mean_error: Array) -> None:
     """Points and errors into the model, and what is not among the observations out of it."""
-    used = set(observations.point3D_ids.tolist())
-    image_id = observations.image_ids[observations.image]
-    kept = set(zip(image_id.tolist(), observations.point2D_idx.tolist(), strict=True))
-    for point3D_id in list(model.point3D_ids()):
-        if point3D_id not in used:
-            model.delete_point3D(point3D_id)
-            continue
-        # Elements are live references into a list that deleting changes.
-        elements = [(e.image_id, e.point2D_idx) for e in model.point3D(point3D_id).track.elements]
-        for element in elements:
-            if element not in kept:
-                model.delete_observation(*element)
+    keep_only(model, observations, observations)
     for point3D_id, xyz, error in zip(observations.point3D_ids.tolist(), observations.points, mean_error, strict=True):
         point = model.point3D(point3D_id)
         point.xyz, point.error = xyz, float(error)
