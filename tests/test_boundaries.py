@@ -27,6 +27,7 @@ LAYERS = [
     {"files.cameras_file", "files.output", "files.surfaces"},
     {"files.model_io"},
     {"estimator.rotation", "estimator.optics"},
+    {"estimator.robust"},
     {"estimator.neighbours", "estimator.back_projection", "estimator.observed", "estimator.wavy_projection"},
     {"estimator.on_ray", "estimator.scene_residual"},
     {"estimator.elimination"},

@@ -16,7 +16,7 @@ from colmap_refract.files.cameras_file import fit_to_size, known_camera
 from colmap_refract.files.model_io import copy_model
 from colmap_refract.files.sidecar import Sidecar
 from colmap_refract.machine import threads
-from colmap_refract.options import ImageNotes, RefinerOptions
+from colmap_refract.options import ImageNotes, InterfaceShape, RefinerOptions
 from colmap_refract.refiner.advice import Facts, advise, advise_on_input, has_converged
 from colmap_refract.refiner.arrangement import arrange
 from colmap_refract.refiner.averaging import average_groups
@@ -26,6 +26,8 @@ from colmap_refract.refiner.filtering import pinhole_errors
 from colmap_refract.refiner.observations import read_observations
 from colmap_refract.refiner.outcome import make_sidecar, output_frame, statistics, write_back
 from colmap_refract.refiner.plane_solution import solve_planes
+from colmap_refract.refiner.printed_solution import solve_as_printed
+from colmap_refract.refiner.reference_solution import solve_on_reference_rays
 from colmap_refract.refiner.soft_solution import solve_waves
 from colmap_refract.refiner.solution import Way
 
@@ -87,6 +89,7 @@ def refine(
     notes = notes or ImageNotes()
     model = copy_model(reconstruction)
     _check_model(model)
+    _check_registered(model, options.reference_image)
     observations = read_observations(model)
     before = pinhole_errors(observations)
     remarks: list[str] = []
@@ -157,7 +160,14 @@ def refine(
 
 def _way(options: RefinerOptions) -> Way:
     """How the options want a model to be solved."""
-    return solve_waves if options.interface_shape == "soft" else solve_planes
+    if options.reference_rays:
+        return solve_on_reference_rays
+    ways: dict[InterfaceShape, Way] = {
+        "plane": solve_planes,
+        "soft": solve_waves,
+        "soft_as_printed": solve_as_printed,
+    }
+    return ways[options.interface_shape]
 
 
 def _check_model(model: pycolmap.Reconstruction) -> None:
@@ -173,6 +183,15 @@ def _check_model(model: pycolmap.Reconstruction) -> None:
         pose = model.frame(frame_id).rig_from_world
         if not (np.isfinite(pose.rotation.quat).all() and np.isfinite(pose.translation).all()):
             raise RefractError(f"frame {frame_id} has a pose that is not finite: deregister it")
+
+
+def _check_registered(model: pycolmap.Reconstruction, name: str) -> None:
+    """Raises RefractError if an image is in the model without a pose."""
+    if any(image.name == name and not image.has_pose for image in model.images.values()):
+        raise RefractError(
+            f"reference_image: '{name}' is not registered in the model, so nothing is known of where it was: name an "
+            "image that is"
+        )
 
 
 def _replace_cameras(model: pycolmap.Reconstruction, cameras: Mapping[int, pycolmap.Camera]) -> list[str]:

@@ -130,7 +130,7 @@ def _waves(sidecar: Sidecar) -> list[str]:
     ]
     if "level_tilt_deg" in waves:
         tilt, lift = _number(waves["level_tilt_deg"]), _number(waves.get("level_lift"))
-        lines.append(_row("Planes about the mean level", f"tilt {tilt} deg, height {lift} {unit} (1 sigma)"))
+        lines.append(_row("Planes about the mean level", f"tilt {tilt} deg, height {lift} of the distance (1 sigma)"))
     return lines
 
 
