@@ -123,11 +123,14 @@ class RefinerRequest:
     wave_smoothness: float | None = None
     """The paper's lambda, with soft_as_printed: what the normals' differences weigh, in px^2 (with
     residual scene, in squared units of the model). None suits all scenes, so there is no default, but
-    wave_slope_deg s gives one: 2 sigma^2 / ((m - 1) s^2), with the keypoints' noise sigma and m of them in
-    a neighbourhood. Right for waves shorter than that; more is better for longer ones."""
+    wave_slope_deg s gives one: 2 sigma^2 / ((m - 1) s^2), with the pixel_noise sigma and m keypoints in a
+    neighbourhood. Right for waves shorter than that, too little for longer ones."""
     wave_radius: float | None = None
     """Of the neighbourhoods among whose keypoints normals are alike, px, with soft_as_printed.
     By default they hold about ten keypoints."""
+    pixel_noise: float = 0.5
+    """Standard deviation of each coordinate of a keypoint, px, without waves. For the wave_smoothness of
+    soft_as_printed; otherwise it is estimated."""
     wavelength: float | None = None
     """Length of the waves, in metres if interface_distance is given, otherwise in units of the model.
     With soft; estimated by default."""
@@ -259,6 +262,8 @@ class RefinerRequest:
                 f"wave_smoothness {self.wave_smoothness:g} cannot weigh anything: give a number > 0; without any the "
                 "normals are not determined"
             )
+        if not 0 < self.pixel_noise < np.inf:
+            raise RefractError(f"pixel_noise {self.pixel_noise:g} px is not positive; keypoints have about 0.5")
         if self.wave_radius is not None and not 0 < self.wave_radius < np.inf:
             raise RefractError(f"wave_radius {self.wave_radius:g} holds no neighbours: give pixels > 0")
 

@@ -23,6 +23,7 @@ from colmap_refract.estimator.reference_rays import (
     with_distances_in_scene,
     with_other_points,
 )
+from colmap_refract.estimator.scenario import Index
 from colmap_refract.files.sidecar import Sidecar
 from colmap_refract.interface import Array
 from colmap_refract.refiner.arrangement import Arrangement, min_num_points
@@ -34,6 +35,11 @@ from colmap_refract.refiner.uncertainty import Uncertainty, estimate_uncertainty
 
 _LEAST_SHARED = 5
 """Points in common with the reference that tell an image's pose and plane, nine unknowns."""
+
+SHRUNK = (
+    "distances in the scene are less in a smaller scene, and with this noise they are least where nothing is "
+    "refracted: use residual pixels, or hold poses that are known (BundleAdjustment.refine_rig_from_world 0)"
+)
 
 
 def solve_on_reference_rays(
@@ -94,10 +100,7 @@ def _in_scene(criterion: _OnRays, solution: Solution, settings: SolverSettings, 
     adjustment = adjust(posed, settings, on_progress=named(watch, "Distances in the scene"))
     problem = criterion.freely(problem, rays, posed, adjustment, settings)
     if adjustment.termination == "failure" or not is_sound(problem):
-        raise RefractError(
-            "distances in the scene are less in a smaller scene, and with this noise they are least where nothing is "
-            "refracted: use residual pixels, or hold poses that are known (BundleAdjustment.refine_rig_from_world 0)"
-        )
+        raise RefractError(SHRUNK)
     found = replace(posed, state=adjustment.state, points=adjustment.points)
     decrement = estimate_uncertainty(found).decrement
     return replace(
@@ -126,7 +129,7 @@ def check_reference(arrangement: Arrangement, problem: Problem) -> None:
     )
 
 
-def poorly_tied(arrangement: Arrangement, shared: Array) -> tuple[str, ...]:
+def poorly_tied(arrangement: Arrangement, shared: Index) -> tuple[str, ...]:
     """A sentence about images that see too few of the reference's points (I,) to be adjusted, if there are any."""
     names = arrangement.observations.image_names
     poor = [names[i] for i in np.flatnonzero(shared < _LEAST_SHARED)]
@@ -185,4 +188,4 @@ class _OnRays:
 
 def _of_others(rays: ReferenceRays, values: Array) -> Array:
     """Without those of the reference's own observations."""
-    return values[rays.problem.tracks.image != rays.reference]
+    return np.asarray(values[rays.problem.tracks.image != rays.reference])
