@@ -1,8 +1,8 @@
 """The soft constraint as the paper prints it, from a level start: a normal for every observation.
 
 What it finds are poses, points and normals. Beside the model an image has one plane: that of its mean normal through
-the mean of where its rays meet the water. Keypoints of points that the reference does not see take the mean normal of their
-neighbours, and the points go where those rays meet.
+the mean of where its rays meet the water. Keypoints of points that the reference does not see take the mean normal of
+their neighbours, and the points go where those rays meet.
 """
 
 from __future__ import annotations
@@ -11,10 +11,12 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.special import j0
 
 from colmap_refract.errors import RefractError
 from colmap_refract.estimator.adjustment import Adjustment, SolverSettings, settle_points
 from colmap_refract.estimator.chunk import Problem
+from colmap_refract.estimator.neighbours import neighbour_weights
 from colmap_refract.estimator.printed_terms import pixel_weights
 from colmap_refract.estimator.printed_unknowns import Pairing, blocks_at_start, pair, points_in_reference
 from colmap_refract.estimator.scenario import Index
@@ -26,7 +28,7 @@ from colmap_refract.refiner.continuation import Watch, is_sound, named, residual
 from colmap_refract.refiner.filtering import Filtered, filter_observations, reprojection_errors
 from colmap_refract.refiner.reference_solution import SHRUNK, check_reference, poorly_tied
 from colmap_refract.refiner.selection import Selection
-from colmap_refract.refiner.soft import level_start
+from colmap_refract.refiner.soft import level_start, wave_options
 from colmap_refract.refiner.soft_solution import check_waves
 from colmap_refract.refiner.solution import Solution, from_scratch
 from colmap_refract.refiner.uncertainty import Uncertainty
@@ -36,6 +38,8 @@ MOST_UNKNOWNS = 60_000
 _FUNCTION_TOLERANCE = 1e-6
 """The planes are such weak directions that less than this ends at no place that is any better."""
 _NEIGHBOURS = 10
+_SHORT = 1e-9
+"""A wavelength over which no two keypoints' normals are alike."""
 _WIDE = 4.0
 """Times the median residual at the start, which is mostly waves: the scale of the loss."""
 
@@ -163,21 +167,41 @@ def _radius(arrangement: Arrangement, rows: Index) -> float:
 
 
 def _smoothness(arrangement: Arrangement, begin: Problem, pairing: Pairing, radius: float) -> float:
-    """The paper's `lambda` in units of the solve: the user's, or what noise and slopes make of it."""
+    """The paper's `lambda` in units of the solve: the user's, or what noise and waves make of it.
+
+    It weighs the data against the regulariser `R` as probabilities do, if it is `2 n sigma^2 / E(R)` with `n` normals.
+    Normals differ by `E|n_k - n_l|^2 = 2 s^2 (1 - rho)`, where `rho` is `J0` of their distance over the wavelength for
+    waves from all sides, and 0 if nothing is said of it: then `E(R) = n (m - 1) s^2`.
+    """
     options, observations = arrangement.options, arrangement.observations
     if options.wave_smoothness is not None:
         return options.wave_smoothness / (arrangement.unit**2 if options.residual == "scene" else 1.0)
     assert options.wave_slope_deg is not None
     rows = np.concatenate([pairing.of_reference, pairing.others])
-    sizes = []
+    rows = rows[begin.tracks.wet[rows]]
+    normal, distance = begin.state.planes_in_cam(begin.structure)
+    expected, free = 0.0, 0
     for i in np.unique(observations.image[rows]).tolist():
-        pixels = observations.pixel[rows[observations.image[rows] == i]]
-        sizes.append(cKDTree(pixels).query_ball_point(pixels, radius, return_length=True))
-    others = float(np.concatenate(sizes).mean()) - 1.0
-    if not others > 0:
+        mine = rows[observations.image[rows] == i]
+        pairs = neighbour_weights(observations.pixel[mine], radius).tocoo()
+        ray = observations.direction[mine]
+        foot = ray / (ray @ normal[i])[:, None]
+        apart = np.linalg.norm(foot[pairs.row] - foot[pairs.col], axis=1)
+        alike = j0(2.0 * np.pi * apart / _wavelength(arrangement, float(distance[i])))
+        expected += float(pairs.data @ (2.0 * (1.0 - alike)))
+        free += 2 * (len(mine) - 1)
+    if not expected > 0:
         raise RefractError(f"wave_radius {radius:g} px holds no neighbours of any keypoint: give a larger one")
     noise = options.pixel_noise * (_units_per_pixel(begin, pairing) if options.residual == "scene" else 1.0)
-    return float(2.0 * noise**2 / (others * np.tan(np.radians(options.wave_slope_deg)) ** 2))
+    return float(free * noise**2 / (expected * np.tan(np.radians(options.wave_slope_deg)) ** 2))
+
+
+def _wavelength(arrangement: Arrangement, distance: float) -> float:
+    """Over an interface's distance, in units of the solve; next to nothing if it is not given."""
+    given = wave_options(arrangement)
+    if given.wavelength is not None:
+        return given.wavelength
+    return _SHORT if given.wavelength_in_depths is None else given.wavelength_in_depths / distance
 
 
 def _units_per_pixel(problem: Problem, pairing: Pairing) -> float:
