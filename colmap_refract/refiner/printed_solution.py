@@ -34,7 +34,7 @@ from colmap_refract.refiner.solution import Solution, from_scratch
 from colmap_refract.refiner.uncertainty import Uncertainty
 
 MOST_UNKNOWNS = 60_000
-"""Some 25 000 observations. An iteration evaluates each in Python, and hundreds may be needed."""
+"""Some 25 000 observations. An iteration, of which hundreds may be needed, evaluates each through Python: seconds."""
 _FUNCTION_TOLERANCE = 1e-6
 """The planes are such weak directions that less than this ends at no place that is any better."""
 _NEIGHBOURS = 10
@@ -145,7 +145,7 @@ def _check_size(arrangement: Arrangement, pairing: Pairing) -> None:
     if unknowns > MOST_UNKNOWNS:
         raise RefractError(
             f"soft_as_printed would have {unknowns} unknowns, a normal for each of {len(pairing.others)} observations; "
-            f"more than {MOST_UNKNOWNS} take too long: use interface_shape soft"
+            f"more than {MOST_UNKNOWNS} take hours: use interface_shape soft"
         )
 
 
