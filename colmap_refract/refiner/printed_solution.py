@@ -22,10 +22,10 @@ from colmap_refract.estimator.printed_unknowns import Pairing, blocks_at_start, 
 from colmap_refract.estimator.scenario import Index
 from colmap_refract.estimator.soft_as_printed import PrintedAdjustment, adjust_as_printed
 from colmap_refract.files.sidecar import Sidecar
-from colmap_refract.interface import Array, tangent_basis
 from colmap_refract.refiner.arrangement import Arrangement
-from colmap_refract.refiner.continuation import Watch, is_sound, named, residuals, retriangulate
+from colmap_refract.refiner.continuation import Watch, is_sound, named, residuals
 from colmap_refract.refiner.filtering import Filtered, filter_observations, reprojection_errors
+from colmap_refract.refiner.own_normals import everywhere, slope_deviation
 from colmap_refract.refiner.reference_solution import SHRUNK, check_reference, poorly_tied
 from colmap_refract.refiner.selection import Selection
 from colmap_refract.refiner.soft import level_start, wave_options
@@ -84,7 +84,7 @@ def solve_as_printed(
         settings=replace(settings, function_tolerance=max(settings.function_tolerance, _FUNCTION_TOLERANCE)),
         on_progress=named(watch, "Soft constraint as printed"),
     )
-    flat, wavy = _everywhere(begin, printed, observations.pixel, radius)
+    flat, wavy = everywhere(begin, printed, observations.pixel, radius)
     if printed.termination == "failure" or not is_sound(flat):
         raise RefractError(
             SHRUNK if options.residual == "scene" else
@@ -102,7 +102,7 @@ def solve_as_printed(
     selection = Selection(arrangement=arrangement, problem=flat, keep=keep, marks=marks)
     active, problem = selection.active()
     kept = selection.keep_point
-    deviation = _slope_deviation(wavy, np.isfinite(printed.normals[:, 0]))
+    deviation = slope_deviation(wavy, np.isfinite(printed.normals[:, 0]))
 
     def describe(sidecar: Sidecar, scale: float) -> None:
         of_residual = scale**2 if options.residual == "scene" else 1.0
@@ -210,65 +210,6 @@ def _units_per_pixel(problem: Problem, pairing: Pairing) -> float:
     return float(np.median(1.0 / np.linalg.norm(pixel_weights(problem, pairing, points), ord=2, axis=(1, 2))))
 
 
-def _everywhere(begin: Problem, printed: PrintedAdjustment, keypoints: Array, radius: float) -> tuple[Problem, Problem]:
-    """All observations at the solution, with each image's mean plane, and with normals of their own."""
-    tracks, structure = begin.tracks, begin.structure
-    normal, distance = printed.state.planes_in_cam(structure)
-    image = tracks.image
-    known = np.isfinite(printed.normals[:, 0])
-    own = np.where(known[:, None], printed.normals, normal[image])
-    for i in np.unique(image[known]).tolist():
-        here, wanting = np.flatnonzero(known & (image == i)), np.flatnonzero(~known & tracks.wet & (image == i))
-        tree = cKDTree(keypoints[here])
-        nearest = tree.query(keypoints[wanting])[1]
-        for k, near, first in zip(
-            wanting.tolist(), tree.query_ball_point(keypoints[wanting], radius), nearest.tolist(), strict=True
-        ):
-            own[k] = own[here[near or [first]]].mean(axis=0)
-    # One coefficient, of value 1, whose shape on the surface is each keypoint's own slope, without any height.
-    axes = np.zeros((structure.num_images, 3, 2))
-    refracted = structure.image_plane >= 0
-    axes[refracted] = [tangent_basis(n) for n in normal[refracted]]
-    slopes = np.einsum("nia,ni->na", axes[image], own) / np.einsum("ni,ni->n", own, normal[image])[:, None]
-    waves = np.zeros((len(image), 3, 1))
-    waves[:, 1:, 0] = np.where(refracted[image][:, None], slopes, 0.0)
-    points = np.where(np.isfinite(printed.points), printed.points, begin.points)
-    at = replace(begin, state=printed.state, points=points, held=replace(begin.held, waves=True))
-    wavy = replace(
-        at,
-        tracks=tracks._replace(waves=waves, sight=tracks.direction.copy()),
-        structure=replace(structure, wave_axes=axes),
-        state=replace(at.state, waves=np.ones((structure.num_images, 1))),
-    )
-    return _with_mean_planes(at, own, known), replace(wavy, points=retriangulate(wavy).points)
-
-
-def _with_mean_planes(problem: Problem, own: Array, known: Array) -> Problem:
-    """Planes of the mean of the normals `own` (N, 3) that are `known`, through the mean of where the rays meet them."""
-    structure, state, image = problem.structure, problem.state, problem.tracks.image
-    rotation, translation = state.cam_from_world(structure)
-    cam_normal, cam_distance = state.planes_in_cam(structure)
-    with np.errstate(invalid="ignore"):
-        ray = problem.tracks.direction
-        reach = cam_distance[image] / np.einsum("ni,ni->n", ray, cam_normal[image])
-    place = reach[:, None] * ray
-    normal, distance = state.normal.copy(), state.distance.copy()
-    for block in range(structure.num_planes):
-        mine = np.flatnonzero(known & (structure.image_plane[image] == block))
-        if not len(mine):
-            continue
-        normals, places, anchor = own[mine], place[mine], np.zeros(3)
-        if structure.plane_in_world[block]:
-            turn = rotation[image[mine]]
-            normals = np.einsum("nji,nj->ni", turn, normals)
-            places = np.einsum("nji,nj->ni", turn, places - translation[image[mine]])
-            anchor = structure.plane_anchor[block]
-        mean = normals.mean(axis=0)
-        normal[block] = mean / np.linalg.norm(mean)
-        distance[block] = normal[block] @ (places.mean(axis=0) - anchor)
-    return replace(problem, state=replace(state, normal=normal, distance=distance))
-
-
 def _filter(arrangement: Arrangement, flat: Problem, wavy: Problem) -> Filtered:
     """What to remove: errors are those through the normals, angles those of the mean planes."""
     options = arrangement.options
@@ -279,13 +220,6 @@ def _filter(arrangement: Arrangement, flat: Problem, wavy: Problem) -> Filtered:
     if options.filter_max_reproj_error > 0:
         large = reprojection_errors(wavy, arrangement.observations) > options.filter_max_reproj_error
     return replace(angles, keep=angles.keep & ~large, num_large_error=int(large.sum()))
-
-
-def _slope_deviation(wavy: Problem, known: Array) -> float:
-    """Root mean square slope of the recovered normals about the mean of their image's, degrees."""
-    slopes, image = wavy.tracks.waves[known, 1:, 0], wavy.tracks.image[known]
-    squares = [((slopes[image == i] - slopes[image == i].mean(axis=0)) ** 2).sum(axis=1) for i in np.unique(image)]
-    return float(np.degrees(np.arctan(np.sqrt(np.concatenate(squares).mean()))))
 
 
 def _as_adjustment(printed: PrintedAdjustment) -> Adjustment:
