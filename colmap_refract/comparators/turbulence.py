@@ -24,7 +24,7 @@ from colmap_refract.interface import Array
 _LEAST, _MOST = 0.02, 50.0
 """Depths of the water over the interface's distance that are looked for."""
 _GRID = 40
-_ZOOM, _ZOOM_POINTS = 12, 7
+_ZOOM, _ZOOM_POINTS = 7, 15
 _FREEDOM = 10.0
 _LEAST_OWN = 1e-3
 """Least `tau` over all slopes: second-order effects at least are there."""
