@@ -31,6 +31,15 @@ class Field:
         values = [map_coordinates(self.displacements[..., k], points.T[::-1], order=1, mode="nearest") for k in (0, 1)]
         return np.column_stack(values)
 
+    def after(self, first: Field) -> Field:
+        """The field (H, W, 2) of two steps: `first` from a picture (H, W), and this one from where that leads."""
+        height, width = first.displacements.shape[:2]
+        y, x = np.mgrid[0:height, 0:width].astype(np.float32)
+        x += first.displacements[..., 0]
+        y += first.displacements[..., 1]
+        on = cv2.remap(self.displacements, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return Field(np.asarray(on + first.displacements))
+
     def straighten(self, frame: Gray) -> Gray:
         """The frame (H, W) as it would be if the field were zero: like the reference, as far as the field is right."""
         height, width = self.displacements.shape[:2]
