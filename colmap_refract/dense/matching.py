@@ -9,8 +9,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_refract.dense.grid import Grid
 from colmap_refract.dense.options import DenseOptions
@@ -99,14 +102,12 @@ def local_correlation(first: Gray, second: Gray, half_window: int) -> Array:
     """Normalised correlation (H, W) of the squares around each pixel of two pictures; 0 where one has no contrast."""
     size = (2 * half_window + 1, 2 * half_window + 1)
 
-    def mean(values: Array) -> Array:
+    def mean(values: NDArray[Any]) -> NDArray[Any]:
         return np.asarray(cv2.boxFilter(values, cv2.CV_32F, size, borderType=cv2.BORDER_REFLECT_101))
 
     # About the middle of the scale, for the digits of single precision.
     a, b = (picture.astype(np.float32) - np.float32(128) for picture in (first, second))
     mean_a, mean_b = mean(a), mean(b)
-    norm = np.sqrt(
-        np.maximum(mean(a * a) - mean_a**2, 0) * np.maximum(mean(b * b) - mean_b**2, 0)
-    )
+    norm = np.sqrt(np.maximum(mean(a * a) - mean_a**2, 0) * np.maximum(mean(b * b) - mean_b**2, 0))
     result = mean(a * b) - mean_a * mean_b
-    return np.divide(result, norm, out=np.zeros_like(norm), where=norm > _LEAST_CONTRAST)
+    return np.where(norm > _LEAST_CONTRAST, result / np.maximum(norm, _LEAST_CONTRAST), 0.0)

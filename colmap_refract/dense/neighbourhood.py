@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_refract.dense.known_images import Mask
 from colmap_refract.interface import Array
@@ -59,7 +62,7 @@ def normals(points: Array, toward: Array) -> Array:
         (rows, columns, 3); NaN where there is no point, or fewer than eight about it.
     """
     shape = points.shape[:2]
-    there = np.isfinite(points).all(axis=2)
+    there: Mask = np.asarray(np.isfinite(points).all(axis=2))
     result = np.full(points.shape, np.nan)
     if not there.any():
         return result
@@ -67,7 +70,7 @@ def normals(points: Array, toward: Array) -> Array:
     # About the middle, and filled with nothing, for sums over windows to keep their digits.
     local = np.where(there[..., None], points - middle, 0.0)
 
-    def total(values: Array) -> Array:
+    def total(values: NDArray[Any]) -> Array:
         side = 2 * _NORMAL_REACH + 1
         return np.asarray(
             cv2.boxFilter(

@@ -10,6 +10,7 @@ from colmap_refract.errors import RefractError
 MOST_NODES = 250_000
 """Of the grid, where the step is not given."""
 _FINEST_STEP = 2
+_DEEPEST = 16
 _MIN_ANGLE_DEG, _MIN_ANGLE_FIXED_DEG = 0.5, 0.05
 
 
@@ -76,3 +77,30 @@ class DenseOptions:
     def step_for(self, width: int, height: int) -> int:
         """`step` with its default for an image of a size."""
         return self.step or max(_FINEST_STEP, math.ceil(math.sqrt(width * height / MOST_NODES)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoissonMeshingOptions:
+    """How points become a mesh; names and meanings are COLMAP's."""
+
+    point_weight: float = 1.0
+    """Weight of passing through the points against following their normals. 0: normals alone."""
+    depth: int = 0
+    """Depth of the octree, at most: cells are 1 / 2^depth of the scene. 0: a level finer than the points are apart."""
+    color: bool = True
+    """Whether the mesh has the points' colors."""
+    trim: float | None = None
+    """The mesh is cut away where points are sparser than a cell of this depth of the octree.
+    By default 1.5 levels coarser than the points are apart. 0: keep all."""
+    num_threads: int = 1
+    """Of the mesher; -1: as many as there are cores. More than one helps only where the cores are idle."""
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.point_weight) and self.point_weight >= 0):
+            raise RefractError(f"point_weight {self.point_weight:g} is not a number from 0 on; COLMAP's is 1")
+        if not (self.depth == 0 or 1 <= self.depth <= _DEEPEST):
+            raise RefractError(f"depth {self.depth} is not from 1 to {_DEEPEST}, nor 0, for what the points ask for")
+        if self.trim is not None and not 0 <= self.trim < math.inf:
+            raise RefractError(f"trim {self.trim:g} is not a number from 0 on; 0 keeps all")
+        if self.num_threads < 1 and self.num_threads != -1:
+            raise RefractError(f"num_threads {self.num_threads} is not 1 or more, nor -1 for all cores")

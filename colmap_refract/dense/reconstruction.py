@@ -158,9 +158,7 @@ def _from_reference(
     name = images.names[reference]
     first = read(reference)
     height, width = first.shape
-    grid = Grid(
-        width=width, height=height, step=options.step_for(width, height), margin=options.half_window + 1
-    )
+    grid = Grid(width=width, height=height, step=options.step_for(width, height), margin=options.half_window + 1)
     covered = _covered(images, reference, grid, known)
     nodes = grid.nodes
     pixels = np.full((1 + len(neighbours), len(nodes), 2), np.nan, dtype=np.float32)

@@ -34,9 +34,7 @@ class DensePoints:
     angles: Array
 
 
-def triangulate(
-    images: KnownImages, members: Sequence[int], pixels: Array, max_reproj_error: float
-) -> DensePoints:
+def triangulate(images: KnownImages, members: Sequence[int], pixels: Array, max_reproj_error: float) -> DensePoints:
     """Points from matches.
 
     Points before the interface are met by straight rays.
@@ -57,7 +55,9 @@ def triangulate(
     # Where the rays meet before the water, they were never bent.
     dry = np.isfinite(points).all(axis=1) & np.isfinite(rays[0].distance) & ~images.is_wet(members[0], rays[0], points)
     if dry.any():
-        straight = [images.straight(member, np.where(dry[:, None], pixels[m], np.nan)) for m, member in enumerate(members)]
+        straight = [
+            images.straight(member, np.where(dry[:, None], pixels[m], np.nan)) for m, member in enumerate(members)
+        ]
         rays = [_mixed(dry, one, other) for one, other in zip(straight, rays, strict=True)]
         fits &= np.array([np.isfinite(one.ray).all(axis=1) for one in rays])
         points = _meet(rays, fits, focal)
@@ -98,9 +98,7 @@ def _meet(rays: Sequence[Rays], fits: Mask, focal: Array) -> Array:
     origin = np.ascontiguousarray(np.stack([one.origin for one in rays], axis=1)[fits.T])
     ray = np.ascontiguousarray(np.stack([one.ray for one in rays], axis=1)[fits.T])
     lengths = np.broadcast_to(focal, fits.T.shape)[fits.T]
-    points = nearest_to_rays(
-        _starts(fits), origin, ray, np.ascontiguousarray(lengths), np.zeros((fits.shape[1], 3))
-    )
+    points = nearest_to_rays(_starts(fits), origin, ray, np.ascontiguousarray(lengths), np.zeros((fits.shape[1], 3)))
     # The kernel keeps what it was given where rays are parallel.
     points[(fits.sum(axis=0) < 2) | ~points.any(axis=1)] = np.nan
     return points

@@ -80,8 +80,7 @@ def read_point_cloud(path: Path) -> tuple[Array, Array]:
     if not complete:
         raise RefractError(f"{path} is cut off: it ends before its {count} points do; write it again")
     points, normals = (
-        np.column_stack([columns[name] for name in group.split()]).astype(np.float64)
-        for group in ("x y z", "nx ny nz")
+        np.column_stack([columns[name] for name in group.split()]).astype(np.float64) for group in ("x y z", "nx ny nz")
     )
     return points, normals
 

@@ -59,7 +59,7 @@ def fit_field(points: Array, displacements: Array, shape: tuple[int, int], *, sp
         shape: (H, W) of the pictures.
         spacing: of the nodes, pixels; in between, cubic splines.
     """
-    sides = [np.arange(length) for length in shape]
+    sides = [np.arange(float(length)) for length in shape]
     # At the middle of equal parts of the picture.
     places = [
         (np.arange(count) + 0.5) * length / count - 0.5
