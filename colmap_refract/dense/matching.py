@@ -48,7 +48,12 @@ def predict(places: Array, others: Array, width: int, height: int) -> Field | No
     if sound.sum() < MIN_TRACKS:
         return None
     spacing = _PREDICTION_SPACING * max(1.0, max(width, height) / _COMMON_SIDE)
-    return fit_field(places[sound], (others - places)[sound], (height, width), spacing=spacing)
+    at, moved = places[sound], (others - places)[sound]
+    # What a turn of the camera does is no bend of the field, which is taken to be stiff where points are lacking.
+    trend = np.linalg.lstsq(np.column_stack([at, np.ones(len(at))]), moved, rcond=None)[0]
+    rest = fit_field(at, moved - at @ trend[:2] - trend[2], (height, width), spacing=spacing).displacements
+    y, x = np.mgrid[0:height, 0:width].astype(np.float32)
+    return Field(np.stack([rest[..., k] + trend[0, k] * x + trend[1, k] * y + trend[2, k] for k in (0, 1)], axis=-1))
 
 
 def match(reference: Gray, frame: Gray, grid: Grid, predicted: Field, options: DenseOptions) -> Array:

@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_refract.dense.known_images import Mask
 from colmap_refract.interface import Array
+
+Mask = NDArray[np.bool_]
 
 _NORMAL_REACH = 3  # nodes to each side, that a plane is laid through
 _LEAST_NEIGHBOURS = 8  # of 49
