@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -244,7 +245,7 @@ def _triangulated(
 
 
 def _covered(images: KnownImages, reference: int, grid: Grid, ratio: Array, known: Array) -> Mask:
-    """Which nodes have a known point nearer than a step."""
+    """Which nodes have a known point nearer than a step, or lie between such nodes."""
     rows, columns = grid.shape
     result = np.zeros((rows, columns), dtype=np.bool_)
     if not len(known):
@@ -256,4 +257,6 @@ def _covered(images: KnownImages, reference: int, grid: Grid, ratio: Array, know
         inside = ((place > -0.5) & (place < np.array([columns, rows]) - 0.5)).all(axis=1)
     column, row = np.rint(place[inside]).astype(np.int64).T
     result[row, column] = True
-    return result.ravel()
+    # A node between covered ones is covered, too: alone it would have no neighbours to be judged by.
+    closed = cv2.morphologyEx(result.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    return np.asarray(closed.ravel() > 0)
