@@ -421,6 +421,10 @@ def test_bad_input_to_the_mesher_is_told_in_a_line(tmp_path: Path) -> None:
     assert "no normal" in error(cloud("nan.ply", 500, facing=np.zeros(xyz.shape)))
     assert "at one place" in error(cloud("same.ply", 500, points=np.zeros(xyz.shape)))
     assert "smaller --PoissonMeshing.trim" in error(whole, trim=12.0, depth=6)
+    deeper = tmp_path / "new" / "folder" / "mesh.ply"
+    options = PoissonMeshingOptions(trim=12.0, depth=6)
+    assert "smaller" in error_of(lambda: poisson_mesh(whole, deeper, options))
+    assert not (tmp_path / "new").exists()
     assert "depth 99" in error_of(lambda: PoissonMeshingOptions(depth=99))
     assert not out.exists()
     assert "is the input" in error_of(lambda: poisson_mesh(whole, whole, PoissonMeshingOptions(), overwrite=True))
