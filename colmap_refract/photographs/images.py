@@ -60,6 +60,16 @@ def read_gray(path: Path) -> Gray:
     return _to_8_bit(_decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH))
 
 
+def read_rgb(path: Path) -> NDArray[np.uint8]:
+    """The colours of an image file, (H, W, 3) RGB, 16-bit and floating-point images scaled to 8 bit.
+
+    Raises:
+        RefractError: the file cannot be read.
+    """
+    bgr = _to_8_bit(_decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH))
+    return np.ascontiguousarray(bgr[..., ::-1])
+
+
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height of an image file, pixels, as stored. Decodes the file: it is known to be sound afterwards.
 
@@ -108,11 +118,14 @@ def common_size(by_size: dict[tuple[int, int], list[str]]) -> tuple[int, int]:
 
 
 def shrink(gray: Gray, side: int) -> Gray:
-    """A copy whose longer side has `side` pixels, each the mean of those that it covers; a smaller picture as it is."""
-    scale = side / max(gray.shape)
+    """A copy (H, W) or (H, W, 3) whose longer side has `side` pixels, each the mean of those that it covers.
+
+    A smaller picture stays as it is.
+    """
+    scale = side / max(gray.shape[:2])
     if scale >= 1:
         return gray
-    height, width = (max(1, round(length * scale)) for length in gray.shape)
+    height, width = (max(1, round(length * scale)) for length in gray.shape[:2])
     return np.asarray(cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
