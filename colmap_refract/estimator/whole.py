@@ -205,6 +205,27 @@ class Whole:
         matrix.corner[i[shared] - n, j[shared] - n] += product[shared]
 
 
+def evaluated(problem: Problem, num_threads: int = 1) -> tuple[Whole, float, Array, Banded] | None:
+    """A problem's system, and its cost, gradient and matrix at its state with settled points.
+
+    None where there is nothing free, or a plane lies behind its camera.
+    """
+    system = Whole(problem, num_threads)
+    if not system.keys:
+        return None
+    pool = ThreadPoolExecutor(num_threads) if num_threads > 1 else None
+    try:
+        x = np.zeros(system.num_columns)
+        settled = system.settle(x, system.points, pool)
+        reduced = None if settled is None else system.reduce(x, settled[0], pool)
+    finally:
+        if pool is not None:
+            pool.shutdown()
+    if settled is None or reduced is None:
+        return None
+    return system, settled[1], *reduced
+
+
 def _run(pool: ThreadPoolExecutor | None, job: Callable[[int, int], Any], ranges: list[tuple[int, int]]) -> list[Any]:
     if pool is None or len(ranges) == 1:
         return [job(a, b) for a, b in ranges]

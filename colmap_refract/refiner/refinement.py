@@ -165,7 +165,7 @@ def refine(
             selection, problem, adjustment, uncertainty = _solve(arrangement, settings, earlier, watch)
         else:
             problem, adjustment = soft.wavy.problem, soft.adjustment
-            uncertainty = estimate_uncertainty(soft.solved)
+            uncertainty = estimate_uncertainty(soft.solved, settings.num_threads)
     except FloatingPointError as error:
         raise RefractError(
             f"the adjustment could not be evaluated ({error}): check the model and the scenario"

@@ -36,6 +36,8 @@ _MOST_SCALINGS = 2
 _JOINT_ITERATIONS, _FROZEN_ITERATIONS = 15, 30
 _FINE, _FINER = 1e-6, 1e-8
 """Function tolerances while the waves are looked up anew, and of the last solves."""
+_FAR, _NEAR = 1e4, 1e6
+"""Radii of the first trust region, before there is a solution and from one: smaller ones double the iterations."""
 _NUM_STATISTICS = 6
 _STAYS = 0.15
 """Relative change of the slope deviation that ends the search for it."""
@@ -177,6 +179,7 @@ class _Solver:
             self.settings,
             max_num_iterations=min(self.settings.max_num_iterations, count),
             function_tolerance=max(self.settings.function_tolerance, _FINE if joint else _FINER),
+            initial_trust_region_radius=_FAR if wide else _NEAR,
         )
         joint = joint and not self.always_frozen
         posed = problem if joint else frozen(problem)
@@ -222,14 +225,14 @@ def solve_soft(
         current = wavy.problem
     assert current is not None
     # Only now: statistics of a solution that is still far from its minimum would lead it astray.
-    statistics, level = _updated(wavy, statistics, options)
+    statistics, level = _updated(wavy, statistics, options, settings.num_threads)
     if options.wavelength is None and options.wavelength_in_depths is None:
         statistics, current = _choose_wavelength(solver, current, statistics, level, options)
     for _ in range(_NUM_STATISTICS):
         wavy, *_ = solver.solve(current, statistics, level, statistics_modes, stage="Wave statistics", joint=True)
         current = wavy.problem
         before = statistics
-        statistics, level = _updated(wavy, statistics, options)
+        statistics, level = _updated(wavy, statistics, options, settings.num_threads)
         if abs(np.log(statistics.slope_deviation / before.slope_deviation)) < _STAYS:
             break
     if _effect(wavy.problem) < _MATTERS * statistics.noise:
@@ -370,10 +373,12 @@ def _width(flat: Problem) -> float:
     return float(np.median(widths))
 
 
-def _updated(wavy: Wavy, statistics: WaveStatistics, options: WaveOptions) -> tuple[WaveStatistics, LevelPrior | None]:
+def _updated(
+    wavy: Wavy, statistics: WaveStatistics, options: WaveOptions, num_threads: int
+) -> tuple[WaveStatistics, LevelPrior | None]:
     given = options.slope_deviation is not None
     before = wavy.problem.level_prior
-    statistics, level = estimate_statistics(wavy.problem, statistics, given_slope=given)
+    statistics, level = estimate_statistics(wavy.problem, statistics, given_slope=given, num_threads=num_threads)
     if level is not None and before is not None:
         level = replace(
             level,
@@ -397,7 +402,9 @@ def _choose_wavelength(
             whitening = np.linalg.norm(wavy.problem.tracks.metric, axis=(1, 2))
             before = np.linalg.norm(solver.flat.tracks.metric, axis=(1, 2))
             log_whitening = 2.0 * float(np.log(whitening / before).sum())
-            tried[wavelength] = log_evidence(wavy.problem, statistics.noise, log_whitening), wavy.problem
+            threads = solver.settings.num_threads
+            evidence = log_evidence(wavy.problem, statistics.noise, log_whitening, threads)
+            tried[wavelength] = evidence, wavy.problem
         return tried[wavelength][0]
 
     best = statistics.wavelength
