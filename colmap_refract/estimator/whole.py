@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,8 +21,8 @@ from colmap_refract.estimator import elimination
 from colmap_refract.estimator.assembly import add_groups
 from colmap_refract.estimator.banded import Banded
 from colmap_refract.estimator.chunk import LOSSES, Problem, change_of, image_blocks, media_at, robust_cost, slot_width
-from colmap_refract.estimator.elimination import NUM_SLOTS, PLANE, Anchors, Views
-from colmap_refract.estimator.priors import prior_blocks
+from colmap_refract.estimator.elimination import LEVEL, NUM_SLOTS, PLANE, POSE, Anchors, Views
+from colmap_refract.estimator.priors import all_to_level, first_images, mean_plane, prior_blocks
 from colmap_refract.estimator.scenario import Change, evaluate_views
 from colmap_refract.interface import Array
 
@@ -49,7 +50,10 @@ class Whole:
         tracks, structure, state = problem.tracks, problem.structure, problem.state
         self.problem = problem
         self._loss = (LOSSES[problem.loss], problem.loss_scale)
-        self.priors = prior_blocks(problem)
+        # All planes are compared with the level at once: one by one they take as long as the points.
+        self.priors = prior_blocks(replace(problem, level_prior=None))
+        self._level = mean_plane(structure, state) if problem.level_prior is not None else None
+        self._level_images = first_images(structure)
         self._seen = np.unique(tracks.image)
         lengths = np.diff(tracks.start)
         order = _beside_each_other(problem)
@@ -63,7 +67,9 @@ class Whole:
         self.keys = list(dict.fromkeys(own)) + border
         num_own = len(self.keys) - len(border)
         # What only priors look at, such as the level plane, is everybody's.
-        self.keys += sorted({key for prior in self.priors for key in prior.keys} - set(self.keys))
+        looked_at = {key for prior in self.priors for key in prior.keys}
+        looked_at |= {key for keys in self._level_keys() for key in keys}
+        self.keys += sorted(looked_at - set(self.keys))
         self.widths = {key: slot_width(key[0], state) for key in self.keys}
         firsts = np.concatenate([[0], np.cumsum([self.widths[key] for key in self.keys])]).astype(np.int64)
         self.columns = dict(zip(self.keys, firsts[:-1].tolist(), strict=True))
@@ -97,11 +103,42 @@ class Whole:
         if self.problem.held.points:
             reach = last - first
         of_priors = [0]
-        for prior in self.priors:
-            at = [self.columns[key] for key in prior.keys if self.columns[key] < num_banded]
-            ends = [self.columns[key] + self.widths[key] - 1 for key in prior.keys if self.columns[key] < num_banded]
+        for keys in [*(prior.keys for prior in self.priors), *self._level_keys()]:
+            at = [self.columns[key] for key in keys if self.columns[key] < num_banded]
+            ends = [self.columns[key] + self.widths[key] - 1 for key in keys if self.columns[key] < num_banded]
             of_priors += [max(ends) - min(at)] if at else []
         return int(min(max(int(reach.max(initial=0)), *of_priors, 0), max(num_banded - 1, 0)))
+
+    def _level_keys(self) -> list[list[Key]]:
+        """The blocks that the comparison of each free plane with the level looks at."""
+        held, structure = self.problem.held, self.problem.structure
+        if self._level is None:
+            return []
+        free = ~(held.normals & held.distances)
+        keys = []
+        for block, image in enumerate(self._level_images.tolist()):
+            pose = int(structure.image_pose[image])
+            own: list[Key] = [] if held.poses[pose] else [(POSE, pose)]
+            keys.append([*own, (PLANE, block), (LEVEL, 0)] if free[block] else [])
+        return keys
+
+    def _of_level(self, x: Array) -> list[tuple[list[Key], Array, list[Array]]]:
+        """`(blocks, residual, derivative by each)` of every free plane."""
+        problem = self.problem
+        if self._level is None or problem.level_prior is None:
+            return []
+        change, weights = self.change(x), problem.level_prior.weights
+        pose = change.pose[problem.structure.image_pose[self._level_images]]
+        deviation, *by = all_to_level(
+            problem.structure, problem.state, self._level_images, pose, change.plane, self._level,
+            x[self.columns[LEVEL, 0] : self.columns[LEVEL, 0] + 3],
+        )  # fmt: skip
+        by = [weights[:, None] * part for part in by]
+        found = []
+        for block, keys in enumerate(self._level_keys()):
+            if keys:
+                found.append((keys, weights * deviation[block], [part[block] for part in by[-len(keys) :]]))
+        return found
 
     def _find_held(self) -> NDArray[np.int64]:
         held, columns = self.problem.held, []
@@ -150,6 +187,8 @@ class Whole:
             )
         for prior in self.priors:
             cost += 0.5 * float((prior.evaluate(self._of(prior.keys, x))[0] ** 2).sum())
+        for _, residual, _ in self._of_level(x):
+            cost += 0.5 * float(residual @ residual)
         return (points, cost) if np.isfinite(cost) else None
 
     def _of(self, keys: list[Key], x: Array) -> list[Array]:
@@ -184,6 +223,8 @@ class Whole:
         for prior in self.priors:
             residual, by_blocks = prior.evaluate(self._of(prior.keys, x))
             self._add_prior(matrix, gradient, prior.keys, residual, by_blocks)
+        for keys, residual, by_blocks in self._of_level(x):
+            self._add_prior(matrix, gradient, keys, residual, by_blocks)
         gradient[self.held_columns] = 0.0
         matrix.hold(self.held_columns)
         return gradient, matrix

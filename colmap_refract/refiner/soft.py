@@ -46,6 +46,8 @@ _MATTERS = 0.5
 _MOST_FROZEN = 6
 _SETTLED = 0.05
 """Noise deviations by which predicted keypoints still move between the rounds that end the last solves."""
+_NEARLY = 4.0
+"""Times that: only then is a fine tolerance worth its iterations."""
 _LOSS_SCALE_IN_NOISE = 4.0
 _WIDE = 4.0
 """Times the median residual: the scale of the loss of the first solves."""
@@ -163,6 +165,7 @@ class _Solver:
         joint: bool,
         wide: bool = False,
         iterations: int | None = None,
+        fine: bool = True,
     ) -> tuple[Wavy, Adjustment, Problem]:
         """One round: the design at the current solution, and a solve."""
         if self.options.wavelength_in_depths is not None:
@@ -178,7 +181,7 @@ class _Solver:
         quick = replace(
             self.settings,
             max_num_iterations=min(self.settings.max_num_iterations, count),
-            function_tolerance=max(self.settings.function_tolerance, _FINE if joint else _FINER),
+            function_tolerance=max(self.settings.function_tolerance, _FINER if fine and not joint else _FINE),
             initial_trust_region_radius=_FAR if wide else _NEAR,
         )
         joint = joint and not self.always_frozen
@@ -258,13 +261,16 @@ def _frozen_rounds(
     solver: _Solver, current: Problem, statistics: WaveStatistics, level: LevelPrior | None
 ) -> SoftSolution:
     """The last solves: the waves' effects as they stand, and looked up anew until they stay."""
+    change = np.inf
     for number in range(_MOST_FROZEN):
+        fine = change < _NEARLY * _SETTLED or number == _MOST_FROZEN - 1
         wavy, adjustment, solved = solver.solve(
-            current, statistics, level, solver.options.num_modes, stage=f"Waves, round {number + 1}", joint=False
-        )
-        settled = number > 0 and _change(current, wavy.problem) < _SETTLED
+            current, statistics, level, solver.options.num_modes, stage=f"Waves, round {number + 1}", joint=False,
+            fine=fine,
+        )  # fmt: skip
+        change = _change(current, wavy.problem)
         current = wavy.problem
-        if settled:
+        if fine and number > 0 and change < _SETTLED:
             break
     return SoftSolution(wavy=wavy, statistics=statistics, level=level, adjustment=adjustment, solved=solved)
 
