@@ -263,10 +263,7 @@ def adjust(
         FloatingPointError: the reduced system is not finite.
     """
     if problem.num_waves and not (
-        problem.on_rays
-        or problem.pinned_pose is not None
-        or anchor_weights is not None
-        or plane_deviations is not None
+        problem.on_rays or problem.pinned_pose is not None or anchor_weights is not None or plane_deviations is not None
     ):
         return _adjust_whole(problem, settings, on_progress)
     chunks = split(problem, settings.num_threads)

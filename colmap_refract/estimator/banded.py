@@ -194,7 +194,7 @@ def factorize(matrix: Banded) -> Factor | None:
             lower = np.linalg.cholesky(left)
         except np.linalg.LinAlgError:
             return None
-        corner = np.linalg.inv(left) if len(left) else left
+        corner = np.asarray(np.linalg.inv(left), dtype=np.float64)
     log_determinant = 2.0 * float(np.log(band[:, 0]).sum() + np.log(np.diag(lower)).sum())
     return Factor(band=band, across=across, corner=corner, log_determinant=log_determinant)
 

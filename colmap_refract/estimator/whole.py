@@ -77,9 +77,9 @@ class Whole:
         num_banded = int(firsts[num_own])
         self.num_shared = self.num_columns - num_banded
         self._columns = np.full((structure.num_images, NUM_SLOTS), -1, dtype=np.int32)
-        for image, blocks in blocks_of.items():
+        for seen, blocks in blocks_of.items():
             for key in blocks:
-                self._columns[image, key[0]] = self.columns[key]
+                self._columns[seen, key[0]] = self.columns[key]
         self._reach = self._find_reach(blocks_of, lengths, num_banded)
         self.held_columns = self._find_held()
         self._members, self._bounds = _groups(problem, lengths)
@@ -93,11 +93,11 @@ class Whole:
         """Columns between the first and the last of those that share a point, at most."""
         first = np.full(self.problem.structure.num_images, self.num_columns)
         last = np.zeros(self.problem.structure.num_images, dtype=np.int64)
-        for image, blocks in blocks_of.items():
+        for seen, blocks in blocks_of.items():
             banded = [key for key in blocks if self.columns[key] < num_banded]
             if banded:
-                first[image] = min(self.columns[key] for key in banded)
-                last[image] = max(self.columns[key] + self.widths[key] for key in banded) - 1
+                first[seen] = min(self.columns[key] for key in banded)
+                last[seen] = max(self.columns[key] + self.widths[key] for key in banded) - 1
         image, start = self.problem.tracks.image, self.problem.tracks.start[:-1]
         reach = np.maximum.reduceat(last[image], start) - np.minimum.reduceat(first[image], start)
         if self.problem.held.points:
@@ -303,5 +303,3 @@ def _groups(problem: Problem, lengths: NDArray[np.int64]) -> tuple[NDArray[np.in
         pending += [part[order[len(part) // 2 :]], part[order[: len(part) // 2]]]
     members = np.concatenate([np.zeros(0, np.int64), *parts])
     return members, np.concatenate([[0], np.cumsum([len(part) for part in parts])]).astype(np.int64)
-
-

@@ -49,7 +49,7 @@ class Posterior:
     def covariance(self, columns: Array) -> Array:
         """(k, k) at columns of blocks that one image or all images look at."""
         scale = self.scale[columns]
-        return self.inverse.block(columns) * scale * scale[:, None]
+        return np.asarray(self.inverse.block(columns) * scale * scale[:, None])
 
 
 def posterior(problem: Problem, num_threads: int = 1) -> Posterior | None:
