@@ -73,11 +73,16 @@ def add_groups(
             for slot in range(NUM_SLOTS):
                 views.columns[i, slot] = local[columns[i, slot]] if columns[i, slot] >= 0 else -1
         matrix, slope = np.zeros((size, size)), np.zeros(size)
-        for m in range(bounds[group], bounds[group + 1]):
-            p = members[m]
+        first = bounds[group]
+        rows = np.zeros((3 * (bounds[group + 1] - first), size))
+        for m in range(first, bounds[group + 1]):
+            p, at = members[m], 3 * (m - first)
             total += reduce(
-                points, hold_points, anchors, p, p + 1, tracks, views, optics, loss, scale, matrix, slope, False
+                points, hold_points, anchors, p, p + 1, tracks, views, optics, loss, scale, matrix, slope,
+                rows[at : at + 3], False,
             )  # fmt: skip
+        # Nearly every point is seen by most of the group's images: one product of full matrices is the faster.
+        matrix -= np.dot(rows.T, rows)
         for column in order:
             local[column] = -1
         for a in range(size):

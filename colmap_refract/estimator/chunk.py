@@ -303,7 +303,7 @@ class Chunk:
             pool,
             lambda k, a, b: elimination.reduce(
                 self.points, self._problem.held.points, self.anchors, a, b, self.tracks, views, optics,
-                *self._loss, matrices[k], gradients[k], self._problem.on_rays,
+                *self._loss, matrices[k], gradients[k], np.zeros((0, 0)), self._problem.on_rays,
             ),
         )  # fmt: skip
         for matrix, gradient in zip(matrices[1:], gradients[1:], strict=True):

@@ -618,7 +618,7 @@ def _add_outer(matrix, row, column, weight, by_blocks, a, b, height, width):
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def reduce(
-    points, hold_points, anchors, first_track, stop_track, tracks, views, optics, loss, scale, matrix, gradient,
+    points, hold_points, anchors, first_track, stop_track, tracks, views, optics, loss, scale, matrix, gradient, rows,
     on_rays=False,
 ):  # fmt: skip
     """Add the reduced system of settled points to `matrix` and `gradient`.
@@ -632,7 +632,9 @@ def reduce(
         loss, scale: robust loss and its scale in pixels.
         matrix: (n, n), the upper triangle is added to (blocks on the diagonal are filled).
         gradient: (n,).
-        on_rays: as for `settle`; not for points that are known.
+        rows: (3 m, n) of the m points of the range, zero: what is left here, times itself, remains to be subtracted
+            from the matrix, for whoever multiplies that of many points at once. (0, 0): subtracted here.
+        on_rays: as for `settle`; not for points that are known, nor with rows.
 
     Returns:
         The summed cost.
@@ -757,7 +759,16 @@ def reduce(
                     w0, w1, w2 = _forward(lower, coupling[a, 0, j], coupling[a, 1, j], coupling[a, 2, j])
                     coupling[a, 0, j], coupling[a, 1, j], coupling[a, 2, j] = w0, w1, w2
                     gradient[column + j] -= w0 * y0 + w1 * y1 + w2 * y2
-            for a in range(num_touched):
+            if rows.shape[0] > 0:
+                for a in range(num_touched):
+                    column = touched_column[a]
+                    for row in range(3):
+                        for j in range(touched_width[a]):
+                            rows[3 * (p - first_track) + row, column + j] = coupling[a, row, j]
+                left = 0
+            else:
+                left = num_touched
+            for a in range(left):
                 column = touched_column[a]
                 width = touched_width[a]
                 for b in range(num_touched):

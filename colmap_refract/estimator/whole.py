@@ -16,6 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import reverse_cuthill_mckee
+from threadpoolctl import threadpool_limits
 
 from colmap_refract.estimator import elimination
 from colmap_refract.estimator.assembly import add_groups
@@ -213,7 +214,8 @@ class Whole:
             )  # fmt: skip
             return gradient, matrix
 
-        parts = _run(pool, job, list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)))
+        with threadpool_limits(limits=1, user_api="blas"):
+            parts = _run(pool, job, list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)))
         gradient, matrix = parts[0]
         for other_gradient, other in parts[1:]:
             gradient += other_gradient
