@@ -39,18 +39,17 @@ class Banded:
     def diagonal(self) -> Array:
         return np.concatenate([self.band[:, 0], np.diag(self.corner)])
 
-    def scaled(self, scale: Array) -> Banded:
-        """Rows and columns times `scale` (n + m,)."""
+    def copy(self) -> Banded:
+        return Banded(band=self.band.copy(), border=self.border.copy(), corner=self.corner.copy())
+
+    def scale(self, scale: Array) -> None:
+        """Multiply rows and columns by `scale` (n + m,), in place: these are the largest arrays of a solve."""
         n, width = self.band.shape
         beyond = np.concatenate([scale[:n], np.zeros(width)])
-        below = np.lib.stride_tricks.sliding_window_view(beyond, width)[:n]
-        band = self.band * below
-        band *= scale[:n, None]
-        return Banded(
-            band=band,
-            border=self.border * scale[:n, None] * scale[n:],
-            corner=self.corner * scale[n:, None] * scale[n:],
-        )
+        self.band[...] *= np.lib.stride_tricks.sliding_window_view(beyond, width)[:n]
+        self.band[...] *= scale[:n, None]
+        self.border[...] *= scale[:n, None] * scale[n:]
+        self.corner[...] *= scale[n:, None] * scale[n:]
 
     def add_diagonal(self, values: Array | float) -> None:
         """In place."""
@@ -180,10 +179,10 @@ class Inverse:
 
 
 def factorize(matrix: Banded) -> Factor | None:
-    """None where the matrix is not positive definite."""
+    """None where the matrix is not positive definite; its band is overwritten."""
     n, _ = matrix.band.shape
     with threadpool_limits(limits=1, user_api="blas"):
-        band, info = lapack.dpbtrf(matrix.band.T, lower=1)
+        band, info = lapack.dpbtrf(matrix.band.T, lower=1, overwrite_ab=1)
         if info != 0:
             return None
         band = band.T

@@ -91,12 +91,14 @@ def descend(
         )  # fmt: skip
     assert reduced is not None
     gradient, matrix = _finite(reduced)
+    del reduced
     # Once, so that the trust region keeps its shape.
     scale = 1.0 / (1.0 + np.sqrt(np.maximum(matrix.diagonal, 0.0)))
     radius, slower = tolerances.initial_radius, 2.0
     steepest = float(np.abs(gradient).max(initial=0.0))
     iteration = invalid = 0
-    scaled, slope = matrix.scaled(scale), gradient * scale
+    slope = gradient * scale
+    matrix.scale(scale)
     if on_step is not None:
         on_step(0, cost, steepest, 0.0, True)
 
@@ -114,15 +116,16 @@ def descend(
         if radius < _LEAST_RADIUS:
             return end(True, f"Minimum trust region radius reached: {radius:.6e}")
         iteration += 1
-        damping = np.clip(scaled.diagonal, _LEAST_DIAGONAL, _MOST_DIAGONAL) / radius
-        damped = Banded(band=scaled.band.copy(), border=scaled.border, corner=scaled.corner.copy())
+        damping = np.clip(matrix.diagonal, _LEAST_DIAGONAL, _MOST_DIAGONAL) / radius
+        damped = matrix.copy()
         damped.add_diagonal(damping)
         factor = factorize(damped)
-        del damped
         trial = None
         step, promised = np.zeros_like(x), 0.0
         if factor is not None:
             by = -factor.solve(slope)
+            # No second matrix while the next is made.
+            del factor, damped
             promised = float(-0.5 * slope @ by + 0.5 * by @ (damping * by))
             step = by * scale
             length, reach = float(np.linalg.norm(step)), float(np.linalg.norm(x))
@@ -147,12 +150,15 @@ def descend(
         if small:
             return end(True, f"Function tolerance reached. |cost_change|/cost: {abs(gained) / before:.6e}")
         if accepted:
+            del matrix
             again = system.reduce(x, points, pool)
             if again is None:
                 return end(None, "The solution cannot be evaluated.")
             gradient, matrix = _finite(again)
+            del again
             steepest = float(np.abs(gradient).max(initial=0.0))
-            scaled, slope = matrix.scaled(scale), gradient * scale
+            slope = gradient * scale
+            matrix.scale(scale)
         if on_step is not None:
             on_step(iteration, cost, steepest, float(np.linalg.norm(step)), accepted)
 

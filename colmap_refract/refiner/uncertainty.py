@@ -254,9 +254,9 @@ def _with_waves(problem: Problem, unknown: Uncertainty, num_threads: int) -> Unc
     if not (matrix.diagonal > 0).all():
         return unknown
     scale = 1.0 / np.sqrt(matrix.diagonal)
-    scaled = matrix.scaled(scale)
-    scaled.add_diagonal(_GAUGE_JITTER)
-    factor = factorize(scaled)
+    matrix.scale(scale)
+    matrix.add_diagonal(_GAUGE_JITTER)
+    factor = factorize(matrix)
     if factor is None:
         return unknown
     directions = gauge(problem, system.keys, system.columns, n)

@@ -62,9 +62,9 @@ def posterior(problem: Problem, num_threads: int = 1) -> Posterior | None:
     if not (diagonal > 0).all():
         return None
     scale = 1.0 / np.sqrt(diagonal)
-    scaled = matrix.scaled(scale)
-    scaled.add_diagonal(_JITTER)
-    factor = factorize(scaled)
+    matrix.scale(scale)
+    matrix.add_diagonal(_JITTER)
+    factor = factorize(matrix)
     if factor is None:
         return None
     inverse = factor.inverse()
