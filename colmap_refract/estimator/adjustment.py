@@ -54,7 +54,10 @@ class SolverSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
-    """One iteration of the solver, for whoever watches."""
+    """One iteration of the solver, for whoever watches; or how far another stage is, see `part_done`.
+
+    `total` is None for the solver; else `iteration` of so many parts are done, and nothing else is known.
+    """
 
     iteration: int
     cost: float
@@ -62,6 +65,15 @@ class Progress:
     gradient_max_norm: float
     step_norm: float
     successful: bool
+    total: int | None = None
+
+
+def part_done(done: int, total: int) -> Progress:
+    """How far a stage is that solves nothing."""
+    nan = float("nan")
+    return Progress(
+        iteration=done, cost=nan, rms=nan, gradient_max_norm=nan, step_norm=nan, successful=True, total=total
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,6 +25,7 @@ from colmap_refract.refiner.continuation import (
     MIN_DISTANCE,
     NARROW_VIEW_DEG,
     Watch,
+    counted,
     estimate_noise,
     find_start,
     is_sound,
@@ -165,6 +166,7 @@ def refine(
             selection, problem, adjustment, uncertainty = _solve(arrangement, settings, earlier, watch)
         else:
             problem, adjustment = soft.wavy.problem, soft.adjustment
+            counted(watch, "Uncertainties")(0, 1)
             uncertainty = estimate_uncertainty(soft.solved, settings.num_threads)
     except FloatingPointError as error:
         raise RefractError(
@@ -199,7 +201,7 @@ def refine(
         sidecar.statistics["spatial_correlation"] = correlation.value
         sidecar.statistics["spatial_correlation_std"] = correlation.deviation
     if soft is not None:
-        add_waves(sidecar, arrangement, soft, to_output.scale)
+        add_waves(sidecar, arrangement, soft, to_output.scale, counted(watch, "Surfaces"))
     seconds = (solve_seconds, perf_counter() - started)
     sidecar.statistics.update(
         statistics(reconstruction, model, before, errors, selection, num_unusable, problem, noise, seconds)
@@ -339,7 +341,7 @@ def _solve_soft(
         if changed <= _NEGLIGIBLE_CHANGE:
             break
         soft = go_on(begin, everywhere, keep, soft, settings, watch)
-        everywhere = settle_everywhere(begin, soft)
+        everywhere = settle_everywhere(begin, soft, watch)
     if not keep.all() and len(soft.wavy.problem.tracks.image) != int(keep.sum()):
         soft = go_on(begin, everywhere, keep, soft, settings, watch)
     problem = soft.wavy.problem

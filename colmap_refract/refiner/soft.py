@@ -13,7 +13,7 @@ from colmap_refract.estimator.adjustment import Adjustment, SolverSettings, adju
 from colmap_refract.estimator.chunk import LevelPrior, Problem
 from colmap_refract.interface import Array, plane_in_cam
 from colmap_refract.refiner.arrangement import Arrangement, select_tracks
-from colmap_refract.refiner.continuation import Watch, named, residuals, retriangulate
+from colmap_refract.refiner.continuation import Watch, counted, named, residuals, retriangulate
 from colmap_refract.refiner.filtering import Filtered, filter_observations, in_cameras, predicted_directions
 from colmap_refract.refiner.start import image_depths, viewing_directions, world_plane
 from colmap_refract.refiner.wave_statistics import estimate_statistics, log_evidence
@@ -171,7 +171,7 @@ class _Solver:
         if self.options.wavelength_in_depths is not None:
             length = self.options.wavelength_in_depths / _distance_in_depths(self.flat if current is None else current)
             statistics = replace(statistics, wavelength=length)
-        wavy = with_waves(self.flat, statistics, num_modes, current)
+        wavy = with_waves(self.flat, statistics, num_modes, current, counted(self.watch, f"{stage}, surfaces"))
         scale = _LOSS_SCALE_IN_NOISE * statistics.noise
         if wide:
             # Before waves are known, all residuals are large; wrong matches are larger.
@@ -235,6 +235,7 @@ def solve_soft(
         wavy, *_ = solver.solve(current, statistics, level, statistics_modes, stage="Wave statistics", joint=True)
         current = wavy.problem
         before = statistics
+        counted(watch, "Wave statistics, update")(0, 1)
         statistics, level = _updated(wavy, statistics, options, settings.num_threads)
         if abs(np.log(statistics.slope_deviation / before.slope_deviation)) < _STAYS:
             break
@@ -245,7 +246,12 @@ def solve_soft(
         return _frozen_rounds(solver, wavy.problem, statistics, level)
     whole = _Solver(_part(start, keep), options, settings, watch)
     wavy, *_ = whole.solve(
-        spread_waves(wavy, whole.flat), statistics, level, options.num_modes, stage="Waves", joint=True
+        spread_waves(wavy, whole.flat, counted(watch, "Waves, all observations")),
+        statistics,
+        level,
+        options.num_modes,
+        stage="Waves",
+        joint=True,
     )
     return _frozen_rounds(whole, wavy.problem, statistics, level)
 
@@ -300,12 +306,13 @@ def go_on(
     return _frozen_rounds(solver, _part(everywhere, keep), soft.statistics, soft.level)
 
 
-def settle_everywhere(start: Problem, soft: SoftSolution) -> Problem:
+def settle_everywhere(start: Problem, soft: SoftSolution, watch: Watch | None = None) -> Problem:
     """All observations at a solution of some, weighted as those are."""
     solved = soft.wavy.problem
     flat = replace(start, held=solved.held, wave_prior=None, level_prior=None)
-    spread = spread_waves(soft.wavy, flat)
-    wavy = with_waves(flat, soft.statistics, solved.num_waves, spread)
+    on_image = counted(watch, "Waves, all observations")
+    spread = spread_waves(soft.wavy, flat, on_image)
+    wavy = with_waves(flat, soft.statistics, solved.num_waves, spread, on_image)
     return replace(wavy.problem, loss=solved.loss, loss_scale=solved.loss_scale)
 
 
@@ -409,6 +416,7 @@ def _choose_wavelength(
             before = np.linalg.norm(solver.flat.tracks.metric, axis=(1, 2))
             log_whitening = 2.0 * float(np.log(whitening / before).sum())
             threads = solver.settings.num_threads
+            counted(solver.watch, "Wavelength, evidence")(0, 1)
             evidence = log_evidence(wavy.problem, statistics.noise, log_whitening, threads)
             tried[wavelength] = evidence, wavy.problem
         return tried[wavelength][0]
