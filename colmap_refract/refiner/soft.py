@@ -267,8 +267,10 @@ def _frozen_rounds(
     solver: _Solver, current: Problem, statistics: WaveStatistics, level: LevelPrior | None
 ) -> SoftSolution:
     """The last solves: the waves' effects as they stand, and looked up anew until they stay."""
-    change = np.inf
+    change, solved = np.inf, None
     for number in range(_MOST_FROZEN):
+        # The effects of all observations: not kept beside the next round's.
+        solved = None
         fine = change < _NEARLY * _SETTLED or number == _MOST_FROZEN - 1
         wavy, adjustment, solved = solver.solve(
             current, statistics, level, solver.options.num_modes, stage=f"Waves, round {number + 1}", joint=False,
@@ -278,6 +280,7 @@ def _frozen_rounds(
         current = wavy.problem
         if fine and number > 0 and change < _SETTLED:
             break
+    assert solved is not None
     return SoftSolution(wavy=wavy, statistics=statistics, level=level, adjustment=adjustment, solved=solved)
 
 
