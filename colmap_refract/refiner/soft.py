@@ -25,6 +25,9 @@ _START_RATIO = 0.4
 """Distance over depth of the level plane that a moving interface starts from; the outcome does not depend on it."""
 _FEW_OBSERVATIONS = 400
 """Per image, of the tracks that statistics and a first solution are found with."""
+_FIRST_MODES = ((), (6, 10, 16))
+"""Of the first solves of a swell. With many modes at once a surface can follow wrong matches before the rest is where
+it belongs; with few to begin with, steep waves are not followed. Both are tried."""
 _STATISTICS_MODES = 24
 _FIRST_TILT, _FIRST_LIFT = np.radians(4.0), 0.1
 _FIRST_WAVES = (
@@ -50,11 +53,12 @@ _FINER = 1e-8
 """Function tolerance: the design changes between solves."""
 _FAR, _NEAR = 1e4, 1e6
 """Radii of the first trust region, before there is a solution and from one: smaller ones double the iterations."""
-_MOST_FIRST, _NUM_UPDATES = 6, 3
-"""Solves with a guess of the statistics, until the points stay, and with what they then say of them."""
+_MOST_FIRST, _NUM_WIDE, _NUM_UPDATES = 6, 2, 3
+"""Solves with a guess of the statistics, until the points stay, those of them with a wide loss, and with what they then
+say of the statistics."""
 _STAYS = 0.15
 """Relative change of the slope deviation that ends the search for it."""
-_MOST_LAST = 2
+_MOST_LAST = 1
 """Each round looks the waves up in the last one's solution, noise included: with steep waves further rounds move
 points by many times their deviation along what is hardly determined, at the same cost."""
 _SETTLED, _ALMOST_SETTLED = 0.05, 0.3
@@ -263,15 +267,18 @@ def _find_waves(solver: _Solver, options: WaveOptions) -> Round:
     """The statistics that make the data most probable, at a solution with them: swell or ripples first, then finer."""
     tried: list[tuple[float, float, Round]] = []
     failed: Unsupported | None = None
-    for factor, (statistics, level) in zip(_FIRST_SCALES, _first_guesses(solver.flat, options), strict=False):
+    (swell, level), *ripples = _first_guesses(solver.flat, options)
+    starts = [(_FIRST_SCALES[0], swell, first_modes) for first_modes in _FIRST_MODES]
+    starts += [(_FIRST_SCALES[1], statistics, ()) for statistics, _ in ripples]
+    for factor, statistics, first_modes in starts:
+        if statistics is not swell and any(_is_explained(found) for *_, found in tried):
+            continue
         try:
-            found = _with_statistics(solver, _settled(solver, statistics, level))
+            found = _with_statistics(solver, _settled(solver, statistics, level, first_modes))
         except Unsupported as unsupported:
             failed = unsupported
             continue
         tried.append((_evidence(solver, found), factor, found))
-        if float(np.median(np.abs(raw_residuals(found.wavy, found.solved)))) < _EXPLAINED:
-            break
     if not tried:
         assert failed is not None
         raise failed
@@ -296,21 +303,33 @@ def _solve_once(
     statistics: WaveStatistics,
     level: LevelPrior | None,
     *,
+    most_modes: int = _STATISTICS_MODES,
     wide: bool = False,
 ) -> Round:
-    num_modes = min(_STATISTICS_MODES, solver.options.num_modes)
+    num_modes = min(most_modes, solver.options.num_modes)
     return solver.solve(current, statistics, level, num_modes, stage="Wave statistics", wide=wide)
 
 
-def _settled(solver: _Solver, statistics: WaveStatistics, level: LevelPrior | None) -> Round:
+def _settled(
+    solver: _Solver, statistics: WaveStatistics, level: LevelPrior | None, first_modes: tuple[int, ...]
+) -> Round:
     """Solve until the points stay: statistics of a solution that is far from its minimum would lead it astray."""
-    found = _solve_once(solver, None, statistics, level, wide=True)
-    for number in range(1, _MOST_FIRST):
-        before = found.wavy.problem
-        found = _solve_once(solver, before, statistics, level, wide=number == 1)
-        if _change(before, found.wavy.problem) < _ALMOST_SETTLED:
+    current = None
+    # What few modes leave is what the spectrum has there.
+    rough = replace(statistics, unresolved=1.0)
+    for most_modes in first_modes:
+        current = _solve_once(solver, current, rough, level, most_modes=most_modes, wide=True).wavy.problem
+    for number in range(_MOST_FIRST):
+        before = current
+        found = _solve_once(solver, before, statistics, level, wide=not first_modes and number < _NUM_WIDE)
+        current = found.wavy.problem
+        if before is not None and _change(before, current) < _ALMOST_SETTLED:
             break
     return found
+
+
+def _is_explained(found: Round) -> bool:
+    return float(np.median(np.abs(raw_residuals(found.wavy, found.solved)))) < _EXPLAINED
 
 
 def _with_statistics(solver: _Solver, found: Round) -> Round:

@@ -28,7 +28,7 @@ from colmap_refract.refiner.solution import NEGLIGIBLE_CHANGE, Solution, from_sc
 from colmap_refract.refiner.uncertainty import estimate_uncertainty
 from colmap_refract.refiner.wave_output import add_waves
 
-_NUM_WAVE_FILTERS = 3
+_NUM_WAVE_FILTERS = 1
 _LEAST_KEPT = 0.5
 """Part of the observations without which a solution with waves is none."""
 
