@@ -85,6 +85,10 @@ LAYERS = [
     {"mapping.fixed_camera", "mapping.moving_camera"},
     {"mapping.initial"},
     {"mapping.initial_report"},
+    {"comparators.keypoints", "comparators.level_water"},
+    {"comparators.turbulence"},
+    {"comparators.depth_from_refraction", "comparators.depth_from_turbulence"},
+    {"comparators.methods"},
     {"reconstructor.options", "reconstructor.record", "reconstructor.watcher"},
     {
         "reconstructor.colmap_options", "reconstructor.colmap_process", "reconstructor.contents",
@@ -130,7 +134,7 @@ LIBRARIES = {
     "pyceres": {"estimator.adjustment", "estimator.printed_terms", "estimator.soft_as_printed"},
     "pycolmap": {
         "files", "refiner.observations", "refiner.refinement", "refiner.outcome", "calibration", "mapping",
-        "reconstructor", "simulation", "commands.simulator",
+        "comparators", "reconstructor", "simulation", "commands.simulator",
     },
     "tyro": {"cli", "commands"},
     "cv2": {"files.surface_picture", "photographs", "frame_selection", "optical_flow", "calibration"},

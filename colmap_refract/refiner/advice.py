@@ -124,8 +124,8 @@ def _images(facts: Facts) -> list[str]:
     """Images that the filter left without anything."""
     observations = facts.arrangement.observations
     structure = facts.problem.structure
-    # A frame that was averaged with others lives on in the one that stands for them.
-    both = structure.image_pose * (structure.num_planes + 1) + structure.image_plane
+    # A frame that was averaged with others lives on in the one that stands for them. No interface is plane -1.
+    both = structure.image_pose * (structure.num_planes + 1) + structure.image_plane + 1
     counts = np.bincount(both[observations.image], minlength=both.max() + 1)[both]
     lost = [observations.image_names[i] for i in np.flatnonzero(counts == 0)]
     if not lost:

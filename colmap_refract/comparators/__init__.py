@@ -1,0 +1,1 @@
+"""Methods that the paper compares with, and one it calls complementary, each as good as it can be made."""
