@@ -13,7 +13,8 @@ from colmap_refract.interface import Layers
 
 Scenario = Literal["moving_interface", "static_interface", "fixed_camera", "camera_housing"]
 ScenarioOrAuto = Literal["auto", "moving_interface", "static_interface", "fixed_camera", "camera_housing"]
-InterfaceShape = Literal["plane", "soft", "auto"]
+InterfaceShape = Literal["plane", "soft", "soft_as_printed", "auto"]
+Residual = Literal["pixels", "scene"]
 Loss = Literal["trivial", "huber", "soft_l1", "cauchy"]
 
 _STEEPEST_DEG, _MOST_WAVE_MODES = 17.0, 200
@@ -104,12 +105,32 @@ class RefinerRequest:
     reference_image: str = ""
     """Name of the image that interface_distance and interface_normal speak of.
     A fixed camera keeps its pose. By default the one with most observations."""
+    reference_rays: bool = False
+    """Put every point that the reference image sees on the refracted ray of its keypoint there, exactly:
+    the paper's hard constraint with a reference image. Its noise goes into all points, so do so only
+    with a reference that is better than the rest. Points that it does not see are placed afterwards."""
+    residual: Residual = "pixels"
+    """With reference_rays or soft_as_printed. pixels: errors in the images; scene: the paper's, distances
+    in the scene between a point and the refracted rays of its keypoints."""
 
     interface_shape: InterfaceShape = "plane"
     """plane: the interfaces are flat; soft: open water, whose surface waves, differently in every image;
-    auto: what predicts held-out observations best."""
+    soft_as_printed: the paper's own soft constraint, a normal for every observation, smooth among
+    neighbours, for up to tens of images of some hundreds of points; auto: plane or soft, whichever
+    predicts held-out observations best."""
     wave_slope_deg: float | None = None
     """Root mean square slope of the waves, over both axes. With soft; estimated by default."""
+    wave_smoothness: float | None = None
+    """The paper's lambda, with soft_as_printed: what the normals' differences weigh, in px^2 (with
+    residual scene, in squared units of the model). None suits all scenes, so there is no default, but
+    wave_slope_deg s gives one: 2 sigma^2 / ((m - 1) s^2), with the pixel_noise sigma and m keypoints in a
+    neighbourhood. Right for waves shorter than that, too little for longer ones."""
+    wave_radius: float | None = None
+    """Of the neighbourhoods among whose keypoints normals are alike, px, with soft_as_printed.
+    By default they hold about ten keypoints."""
+    pixel_noise: float = 0.5
+    """Standard deviation of each coordinate of a keypoint, px, without waves. For the wave_smoothness of
+    soft_as_printed; otherwise it is estimated."""
     wavelength: float | None = None
     """Length of the waves, in metres if interface_distance is given, otherwise in units of the model.
     With soft; estimated by default."""
@@ -187,12 +208,64 @@ class RefinerRequest:
                 f"num_wave_modes {self.num_wave_modes}: give 4 to {_MOST_WAVE_MODES}; the default is enough for a "
                 "surface that is smooth over the view"
             )
+        self._check_reference()
         for name in ("level_tilt_deg", "level_lift"):
             value = getattr(self, name)
             if value is not None and not 0 < value < np.inf:
                 raise RefractError(f"{name} {value:g} is not a spread: give a number > 0, or level_prior 0")
         if self.random_seed < 0:
             raise RefractError(f"random_seed {self.random_seed}: give a number from 0 on")
+
+    def _check_reference(self) -> None:
+        """What a reference image, and the soft constraint as printed, cannot be combined with."""
+        printed = self.interface_shape == "soft_as_printed"
+        adjustment = self.BundleAdjustment
+        if self.reference_rays and self.interface_shape != "plane":
+            raise RefractError(
+                f"reference_rays are of flat interfaces, not interface_shape {self.interface_shape}: for waves with a "
+                "reference image use soft_as_printed without reference_rays"
+            )
+        if not printed:
+            for name in ("wave_smoothness", "wave_radius"):
+                if getattr(self, name) is not None:
+                    raise RefractError(
+                        f"{name} belongs to interface_shape soft_as_printed: choose that, or leave it out"
+                    )
+        if not (self.reference_rays or printed):
+            if self.residual != "pixels":
+                raise RefractError(
+                    f"residual {self.residual} takes a reference image: add reference_rays, or use soft_as_printed"
+                )
+            return
+        what = "soft_as_printed" if printed else "reference_rays"
+        if not adjustment.refine_points3D:
+            raise RefractError(f"{what} seeks the points: it cannot hold them (BundleAdjustment.refine_points3D)")
+        in_scene = self.residual == "scene" or printed
+        what = "residual scene" if not printed else what
+        if in_scene and any(self.layer_thickness):
+            raise RefractError(f"{what} is for a single refracting surface: leave out layer_thickness")
+        if in_scene and (
+            adjustment.refine_focal_length or adjustment.refine_principal_point or adjustment.refine_extra_params
+        ):
+            raise RefractError(f"{what} takes the intrinsics as known: hold them")
+        if not printed:
+            return
+        if self.refine_refractive_index:
+            raise RefractError("soft_as_printed takes the index as known: leave out refine_refractive_index")
+        if self.wave_smoothness is None and self.wave_slope_deg is None:
+            raise RefractError(
+                "soft_as_printed has no smoothness that suits all scenes: give wave_slope_deg, the waves' root mean "
+                "square slope, or wave_smoothness, the paper's lambda"
+            )
+        if self.wave_smoothness is not None and not 0 < self.wave_smoothness < np.inf:
+            raise RefractError(
+                f"wave_smoothness {self.wave_smoothness:g} cannot weigh anything: give a number > 0; without any the "
+                "normals are not determined"
+            )
+        if not 0 < self.pixel_noise < np.inf:
+            raise RefractError(f"pixel_noise {self.pixel_noise:g} px is not positive; keypoints have about 0.5")
+        if self.wave_radius is not None and not 0 < self.wave_radius < np.inf:
+            raise RefractError(f"wave_radius {self.wave_radius:g} holds no neighbours: give pixels > 0")
 
     def with_scenario(self, scenario: Scenario) -> RefinerOptions:
         """The same with the scenario named."""

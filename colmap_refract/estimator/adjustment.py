@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -124,7 +124,7 @@ def square_root(matrix: Array) -> Array:
 class _ReducedCost(pyceres.CostFunction):  # type: ignore[misc]
     """One chunk as Ceres sees it."""
 
-    def __init__(self, chunk: Chunk, pool: ThreadPoolExecutor | None, watch: _Watch) -> None:
+    def __init__(self, chunk: Chunk, pool: ThreadPoolExecutor | None, watch: SolverWatch) -> None:
         super().__init__()
         self.chunk = chunk
         self.pool = pool
@@ -134,12 +134,12 @@ class _ReducedCost(pyceres.CostFunction):  # type: ignore[misc]
 
     def Evaluate(self, parameters: list[Array], residuals: Array, jacobians: list[Array | None] | None) -> bool:
         # An exception must not travel through Ceres' threads: keep it, fail, and raise it afterwards.
-        if self.watch.exception is not None:
+        if self.watch.errors:
             return False
         try:
             return self._evaluate(parameters, residuals, jacobians)
         except BaseException as exception:
-            self.watch.exception = exception
+            self.watch.errors.append(exception)
             return False
 
     def _evaluate(self, parameters: list[Array], residuals: Array, jacobians: list[Array | None] | None) -> bool:
@@ -172,20 +172,20 @@ class _ReducedCost(pyceres.CostFunction):  # type: ignore[misc]
 class _PriorCost(pyceres.CostFunction):  # type: ignore[misc]
     """A prior as Ceres sees it."""
 
-    def __init__(self, block: PriorBlock, watch: _Watch) -> None:
+    def __init__(self, block: PriorBlock, state: State, watch: SolverWatch) -> None:
         super().__init__()
         self.block = block
         self.watch = watch
         self.set_num_residuals(block.num_residuals)
-        self.set_parameter_block_sizes([slot_width(slot, watch.state) for slot, _ in block.keys])
+        self.set_parameter_block_sizes([slot_width(slot, state) for slot, _ in block.keys])
 
     def Evaluate(self, parameters: list[Array], residuals: Array, jacobians: list[Array | None] | None) -> bool:
-        if self.watch.exception is not None:
+        if self.watch.errors:
             return False
         try:
             values, by_blocks = self.block.evaluate(parameters)
         except BaseException as exception:
-            self.watch.exception = exception
+            self.watch.errors.append(exception)
             return False
         residuals[:] = values
         for jacobian, by_block in zip(jacobians or [], by_blocks, strict=False):
@@ -195,24 +195,30 @@ class _PriorCost(pyceres.CostFunction):  # type: ignore[misc]
 
 
 @dataclass
-class _Watch:
-    """What happens during a solve: the exception to raise afterwards, and the last gradient."""
+class SolverWatch:
+    """What happens during a solve: the exception to raise afterwards, if any, and the last gradient."""
 
     on_progress: Callable[[Progress], None] | None
     num_observations: int
-    state: State
-    exception: BaseException | None = None
+    errors: list[BaseException] = field(default_factory=list)
     gradient_max_norm: float = float("nan")
 
+    def raise_error(self) -> None:
+        """Raise what stopped the solve, if anything did."""
+        if self.errors:
+            raise self.errors[0]
 
-class _Callback(pyceres.IterationCallback):  # type: ignore[misc]
-    def __init__(self, watch: _Watch) -> None:
+
+class SolverCallback(pyceres.IterationCallback):  # type: ignore[misc]
+    """Reports every iteration to a watch, and stops Ceres once something was raised."""
+
+    def __init__(self, watch: SolverWatch) -> None:
         super().__init__()
         self.watch = watch
 
     def __call__(self, summary: Any) -> Any:
         watch = self.watch
-        if watch.exception is not None:
+        if watch.errors:
             return pyceres.CallbackReturnType.SOLVER_ABORT
         try:
             watch.gradient_max_norm = float(summary.gradient_max_norm)
@@ -228,7 +234,7 @@ class _Callback(pyceres.IterationCallback):  # type: ignore[misc]
                     )
                 )
         except BaseException as exception:
-            watch.exception = exception
+            watch.errors.append(exception)
             return pyceres.CallbackReturnType.SOLVER_ABORT
         return pyceres.CallbackReturnType.SOLVER_CONTINUE
 
@@ -265,7 +271,7 @@ def adjust(
     priors = prior_blocks(problem)
     keys = sorted({key for chunk in chunks for key in chunk.keys} | {key for prior in priors for key in prior.keys})
     blocks = _Blocks(keys, {key: np.zeros(slot_width(key[0], problem.state)) for key in keys})
-    watch = _Watch(on_progress, len(problem.tracks.image), problem.state)
+    watch = SolverWatch(on_progress, len(problem.tracks.image))
     num_slices = max((len(chunk.slices) for chunk in chunks), default=1)
     pool = ThreadPoolExecutor(num_slices) if num_slices > 1 else None
     try:
@@ -281,7 +287,7 @@ def _solve(
     chunks: list[Chunk],
     priors: list[PriorBlock],
     blocks: _Blocks,
-    watch: _Watch,
+    watch: SolverWatch,
     pool: ThreadPoolExecutor | None,
     plane_deviations: tuple[float, float] | None,
 ) -> Adjustment:
@@ -305,7 +311,9 @@ def _solve(
             [blocks.values[POSE, problem.pinned_pose]],
         )
     for prior in priors:
-        ceres.add_residual_block(_PriorCost(prior, watch), None, [blocks.values[key] for key in prior.keys])
+        ceres.add_residual_block(
+            _PriorCost(prior, problem.state, watch), None, [blocks.values[key] for key in prior.keys]
+        )
     for key in blocks.keys:
         if key[0] != PLANE:
             continue
@@ -319,14 +327,13 @@ def _solve(
     options = solver_options(settings)
     if len(chunks) == 1:
         options.linear_solver_type = pyceres.LinearSolverType.DENSE_NORMAL_CHOLESKY
-    callback = _Callback(watch)
+    callback = SolverCallback(watch)
     options.callbacks = [callback]
     summary = pyceres.SolverSummary()
     # BLAS threads that wait for one another beside Ceres' own made a Cholesky of 600 unknowns take 1 s, not 5 ms.
     with threadpool_limits(limits=1, user_api="blas"):
         pyceres.solve(options, ceres, summary)
-    if watch.exception is not None:
-        raise watch.exception
+    watch.raise_error()
     return Adjustment(
         state=apply(problem.state, change_of(problem.state, blocks.values.items())),
         points=_settled(problem, chunks, blocks, pool),

@@ -28,16 +28,10 @@ from colmap_refract.estimator.elimination import (
     Views,
 )
 from colmap_refract.estimator.optics import Media
+from colmap_refract.estimator.robust import LOSSES
 from colmap_refract.estimator.scenario import Change, State, Structure, evaluate_views
 from colmap_refract.interface import Array, Layers
 from colmap_refract.options import Loss
-
-_LOSSES = {
-    "trivial": elimination.TRIVIAL,
-    "huber": elimination.HUBER,
-    "soft_l1": elimination.SOFT_L1,
-    "cauchy": elimination.CAUCHY,
-}
 
 MAX_CHUNK_COLUMNS = 700
 """Up to this many unknowns all tracks form one chunk; beyond, Ceres' product of the Jacobian with itself,
@@ -233,7 +227,7 @@ class Chunk:
                 self.columns[row, key[0]] = self.first_column[key]
         self._place = {POSE: poses, PLANE: planes, MEDIUM: np.zeros(1, np.int64), LENS: cameras, WAVES: images}
         self._problem = problem
-        self._loss = (_LOSSES[problem.loss], problem.loss_scale)
+        self._loss = (LOSSES[problem.loss], problem.loss_scale)
         self.points = np.ascontiguousarray(problem.points[point_indices])
         self.anchors = Anchors(weight=np.zeros(len(point_indices)), position=self.points.copy())
         # Slices of about equally many observations, for threads within the chunk.

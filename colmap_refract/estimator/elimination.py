@@ -42,6 +42,7 @@ from colmap_refract.estimator.observed import (
 )
 from colmap_refract.estimator.on_ray import eliminate_length, refracted_ray
 from colmap_refract.estimator.optics import FAST, one_interface, slope_derivatives, snell_root
+from colmap_refract.estimator.robust import robust
 from colmap_refract.estimator.scene_residual import observe_in_scene
 from colmap_refract.interface import Array
 
@@ -51,9 +52,6 @@ POSE, PLANE, MEDIUM, LENS, WAVES = range(NUM_SLOTS)
 
 LEVEL = 5
 """The plane that all planes of a moving interface scatter about: no observation looks at it, but a prior does."""
-
-TRIVIAL, HUBER, SOFT_L1, CAUCHY = range(4)
-"""The robust losses."""
 
 MAX_POINT_STEPS = 40
 """Half-solved points make the cost no function of the cameras. Most need one or two steps, a residual near the
@@ -148,23 +146,6 @@ class Anchors(NamedTuple):
 
     weight: Array
     position: Array
-
-
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", inline="always")
-def _robust(s, loss, scale):
-    """`rho(s)` and `rho'(s)` of a squared residual in pixels, Ceres' definitions."""
-    b = scale * scale
-    if loss == HUBER:
-        if s <= b:
-            return s, 1.0
-        root = math.sqrt(s)
-        return 2.0 * scale * root - b, scale / root
-    if loss == SOFT_L1:
-        root = math.sqrt(1.0 + s / b)
-        return 2.0 * b * (root - 1.0), 1.0 / root
-    if loss == CAUCHY:
-        return b * math.log1p(s / b), 1.0 / (1.0 + s / b)
-    return s, 1.0
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", inline="always")
@@ -287,7 +268,7 @@ def _point_system(point, anchor_weight, anchor, first, stop, tracks, views, opti
         else:
             _observe(k, point, tracks, views, optics, False, values)
         e0, e1 = values[RESIDUAL], values[RESIDUAL + 1]
-        rho, weight = _robust(e0 * e0 + e1 * e1, loss, scale)
+        rho, weight = robust(e0 * e0 + e1 * e1, loss, scale)
         cost += 0.5 * rho
         i = tracks.image[k]
         for row in range(2):
@@ -658,7 +639,7 @@ def reduce(
             else:
                 _observe(k, points[p], tracks, views, optics, True, values)
             e0, e1 = values[RESIDUAL], values[RESIDUAL + 1]
-            rho, weight = _robust(e0 * e0 + e1 * e1, loss, scale)
+            rho, weight = robust(e0 * e0 + e1 * e1, loss, scale)
             total += 0.5 * rho
             b00, b01, b02 = _by_world_point(0, views.rotation, i, values)
             b10, b11, b12 = _by_world_point(1, views.rotation, i, values)

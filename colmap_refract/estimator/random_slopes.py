@@ -38,12 +38,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from colmap_refract.estimator.elimination import CAUCHY, HUBER, SOFT_L1, TRIVIAL, _robust
 from colmap_refract.estimator.optics import FAST, one_interface, slope_derivatives, snell_root
+from colmap_refract.estimator.robust import robust
 from colmap_refract.interface import Array
-from colmap_refract.options import Loss
-
-LOSSES: dict[Loss, int] = {"trivial": TRIVIAL, "huber": HUBER, "soft_l1": SOFT_L1, "cauchy": CAUCHY}
 
 MAX_STEPS = 100
 _SETTLED, _SETTLED_BY_COST = 1e-10, 1e-12
@@ -192,7 +189,7 @@ def _system(point, p, weigh, sights, views, optics, deviations, loss, scale, val
         w00, w01, w11 = weight[k - first]
         e0, e1 = values[_ERROR], values[_ERROR + 1]
         f0, f1 = w00 * e0 + w01 * e1, w01 * e0 + w11 * e1
-        rho, factor = _robust(e0 * f0 + e1 * f1, loss, scale)
+        rho, factor = robust(e0 * f0 + e1 * f1, loss, scale)
         cost += 0.5 * rho
         for a in range(3):
             j0, j1 = values[_BY_POINT + a], values[_BY_POINT + 3 + a]
@@ -275,7 +272,7 @@ def _cost(point, p, weight, sights, views, optics, deviations, loss, scale, valu
         _observe(k, point, sights, views, optics, deviations, values)
         w00, w01, w11 = weight[k - first]
         e0, e1 = values[_ERROR], values[_ERROR + 1]
-        rho, _ = _robust(w00 * e0 * e0 + 2.0 * w01 * e0 * e1 + w11 * e1 * e1, loss, scale)
+        rho, _ = robust(w00 * e0 * e0 + 2.0 * w01 * e0 * e1 + w11 * e1 * e1, loss, scale)
         cost += 0.5 * rho
     return cost
 

@@ -33,7 +33,15 @@ import pyceres
 from threadpoolctl import threadpool_limits
 
 from colmap_refract.errors import RefractError
-from colmap_refract.estimator.adjustment import Progress, SolverSettings, Termination, solver_options, termination_of
+from colmap_refract.estimator.adjustment import (
+    Progress,
+    SolverCallback,
+    SolverSettings,
+    SolverWatch,
+    Termination,
+    solver_options,
+    termination_of,
+)
 from colmap_refract.estimator.chunk import Problem, robust_cost
 from colmap_refract.estimator.neighbours import neighbour_weights
 from colmap_refract.estimator.printed_terms import DistanceToRay, ImageViews, pixel_weights
@@ -71,6 +79,8 @@ class PrintedAdjustment:
         num_iterations: of Ceres, rejected steps included.
         termination: Ceres' word for why it stopped; after a `failure` the rest is the start.
         message: Ceres' reason.
+        gradient_max_norm: largest entry of the gradient at the solution, in squared units of the residual per unit of
+            the parameters.
     """
 
     state: State
@@ -82,6 +92,7 @@ class PrintedAdjustment:
     num_iterations: int
     termination: Termination
     message: str
+    gradient_max_norm: float
 
 
 def adjust_as_printed(
@@ -132,10 +143,11 @@ def adjust_as_printed(
     weight = np.broadcast_to(np.eye(2), (len(pairing.others), 2, 2))
     if residual == "pixels":
         weight = pixel_weights(problem, pairing, points_in_reference(problem, problem.state, pairing, blocks))
-    error: list[BaseException] = []
+    watch = SolverWatch(on_progress, len(pairing.others))
     views = {i: ImageViews(problem.structure, problem.state, i, reference) for i in images_of(problem, pairing)}
     costs = [
-        DistanceToRay(problem, pairing, row, blocks, views, weight[row], error) for row in range(len(pairing.others))
+        DistanceToRay(problem, pairing, row, blocks, views, weight[row], watch.errors)
+        for row in range(len(pairing.others))
     ]
     ceres = pyceres.Problem()
     robust = _robust_loss(loss, loss_scale)
@@ -150,7 +162,7 @@ def adjust_as_printed(
         fixed = fixed_of_plane(problem, reference, block)
         if fixed:
             ceres.set_manifold(plane, pyceres.SubsetManifold(3, fixed))
-    summary = _solve(ceres, settings, error, len(costs), on_progress)
+    summary = _solve(ceres, settings, watch)
 
     state = state_after(problem, blocks)
     points = np.full_like(problem.points, np.nan)
@@ -170,6 +182,7 @@ def adjust_as_printed(
         num_iterations=int(summary.num_successful_steps + summary.num_unsuccessful_steps),
         termination=termination_of(summary),
         message=str(summary.message),
+        gradient_max_norm=watch.gradient_max_norm,
     )
 
 
@@ -216,47 +229,14 @@ def _robust_loss(loss: Loss, scale: float) -> Any:
     return None if loss == "trivial" else kinds[loss](scale)
 
 
-class _Callback(pyceres.IterationCallback):  # type: ignore[misc]
-    def __init__(
-        self, error: list[BaseException], num_observations: int, on_progress: Callable[[Progress], None] | None
-    ) -> None:
-        super().__init__()
-        self._error, self._num_observations, self._on_progress = error, num_observations, on_progress
-
-    def __call__(self, summary: Any) -> Any:
-        try:
-            if self._on_progress is not None and not self._error:
-                self._on_progress(
-                    Progress(
-                        iteration=int(summary.iteration),
-                        cost=float(summary.cost),
-                        rms=float(np.sqrt(2.0 * summary.cost / self._num_observations)),
-                        gradient_max_norm=float(summary.gradient_max_norm),
-                        step_norm=float(summary.step_norm),
-                        successful=bool(summary.step_is_successful),
-                    )
-                )
-        except BaseException as exception:
-            self._error.append(exception)
-        stop = pyceres.CallbackReturnType.SOLVER_ABORT
-        return stop if self._error else pyceres.CallbackReturnType.SOLVER_CONTINUE
-
-
-def _solve(
-    ceres: Any,
-    settings: SolverSettings,
-    error: list[BaseException],
-    num_observations: int,
-    on_progress: Callable[[Progress], None] | None,
-) -> Any:
+def _solve(ceres: Any, settings: SolverSettings, watch: SolverWatch) -> Any:
     """Run Ceres on the blocks in place; its summary."""
     options = solver_options(settings)
     options.max_trust_region_radius = _MAX_TRUST_REGION_RADIUS
-    callback = _Callback(error, num_observations, on_progress)
+    callback = SolverCallback(watch)
     options.callbacks = [callback]
     summary = pyceres.SolverSummary()
     with threadpool_limits(limits=1, user_api="blas"):
         pyceres.solve(options, ceres, summary)
-    if error:
-        raise error[0]
+    watch.raise_error()
     return summary

@@ -45,8 +45,8 @@ class Facts:
 
 
 def has_converged(adjustment: Adjustment, uncertainty: Uncertainty) -> bool:
-    """Whether the solver stopped where there is a minimum, and not only because its steps had become small."""
-    return adjustment.termination == "convergence" and uncertainty.decrement <= _STUCK
+    """Whether the solver stopped where there is a minimum, as far as is known, and not only as its steps were small."""
+    return adjustment.termination == "convergence" and not uncertainty.decrement > _STUCK
 
 
 def advise(facts: Facts) -> list[str]:
@@ -66,6 +66,11 @@ def _waves(facts: Facts) -> list[str]:
     if facts.problem.num_waves or facts.problem.tracks.effects.shape[2]:
         return [shape + "the surface has shapes that its modes cannot take; try more --num_wave_modes."]
     options = facts.arrangement.options
+    if options.interface_shape == "soft_as_printed":
+        # Normals that have taken most of the noise leave smooth rests of it.
+        if found.deviation_px < options.pixel_noise:
+            return []
+        return [shape + "the normals are too stiff for the waves; give a smaller --wave_smoothness or --wave_radius."]
     if options.scenario == "camera_housing" or any(options.layer_thickness):
         return [shape + "the intrinsics, the glass or the scenario do not fit the images."]
     return [

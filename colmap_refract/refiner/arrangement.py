@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 
 import numpy as np
 from numpy.typing import NDArray
@@ -306,9 +307,11 @@ def _check_names(names: list[str], options: RefinerOptions, notes: ImageNotes) -
     mentioned += [("reference_image", options.reference_image)] if options.reference_image else []
     for what, name in mentioned:
         if name not in known:
+            near = get_close_matches(name, names, n=2)
+            like = " or ".join(f"'{n}'" for n in near)
             raise RefractError(
-                f"{what}: there is no registered image named '{name}' in the model; its images are named like "
-                f"'{names[0]}'"
+                f"{what}: there is no registered image named '{name}' in the model; "
+                + (f"is {like} meant?" if near else f"its images are named like '{names[0]}'")
             )
     both = sorted(set(notes.interface_groups) & notes.dry_images)
     if both:

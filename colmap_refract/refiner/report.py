@@ -10,6 +10,7 @@ from colmap_refract.files.sidecar import ImageInterface, Sidecar
 
 _WIDTH = 78
 _MOST_ROWS = 20
+_PLACES = {"pixels": "the images", "scene": "the scene"}
 
 
 def report(sidecar: Sidecar) -> str:
@@ -25,7 +26,7 @@ def report(sidecar: Sidecar) -> str:
     lines += _model(sidecar)
     lines += ["", *_interfaces(sidecar)]
     lines += _waves(sidecar)
-    lines += ["", *_solver(sidecar.solver)]
+    lines += ["", *_solver(sidecar)]
     warnings = sidecar.solver.get("warnings") or []
     if warnings:
         lines += ["", *(f"WARNING: {sentence}" for sentence in warnings)]
@@ -70,9 +71,22 @@ def _model(sidecar: Sidecar) -> list[str]:
     lines += [
         _row("Mean reprojection error", _errors(s, "mean")),
         _row("Median reprojection error", _errors(s, "median")),
-        _row("Keypoint noise, 1 sigma per axis", f"{_number(s.get('noise'))} px"),
+        _row("Keypoint noise, 1 sigma per axis", f"{_number(s.get('noise'))} px" + _how_known(s)),
     ]
+    reference = s.get("reference")
+    if reference:
+        lines += [
+            _row(
+                "Reference image", f"{reference.get('image')}, errors in {_PLACES.get(reference.get('residual'), '?')}"
+            ),
+            _row("Points it sees, adjusted", str(reference.get("num_points_adjusted"))),
+            _row("Other points, placed afterwards", str(reference.get("num_points_placed"))),
+        ]
     return lines
+
+
+def _how_known(statistics: dict[str, Any]) -> str:
+    return " (given)" if (statistics.get("waves") or {}).get("num_normals") else ""
 
 
 def _errors(statistics: dict[str, Any], kind: str) -> str:
@@ -123,6 +137,14 @@ def _waves(sidecar: Sidecar) -> list[str]:
     if not waves:
         return []
     unit = "m" if sidecar.units.get("distance") == "metre" else "model units"
+    if waves.get("num_normals"):
+        return [
+            _row("Waves", f"{waves['num_normals']} normals, one per observation; the planes are their means"),
+            _row("Waves, slope about them (rms)", f"{_number(waves.get('slope_deviation_deg'))} deg"),
+            _row(
+                "Smoothness, lambda", f"{_number(waves.get('smoothness'))} within {_number(waves.get('radius_px'))} px"
+            ),
+        ]
     lines = [
         _row("Waves, slope (rms)", f"{_number(waves.get('slope_deviation_deg'))} deg"),
         _row("Waves, dominant wavelength", f"about {_number(waves.get('wavelength'), 2)} {unit}"),
@@ -130,7 +152,7 @@ def _waves(sidecar: Sidecar) -> list[str]:
     ]
     if "level_tilt_deg" in waves:
         tilt, lift = _number(waves["level_tilt_deg"]), _number(waves.get("level_lift"))
-        lines.append(_row("Planes about the mean level", f"tilt {tilt} deg, height {lift} {unit} (1 sigma)"))
+        lines.append(_row("Planes about the mean level", f"tilt {tilt} deg, height {lift} of the distance (1 sigma)"))
     return lines
 
 
@@ -142,16 +164,22 @@ def _scale_worth(sidecar: Sidecar) -> str:
     return f", good to {100 * image.distance_std / image.distance:.2g} %"
 
 
-def _solver(solver: dict[str, Any]) -> list[str]:
+def _solver(sidecar: Sidecar) -> list[str]:
+    solver = sidecar.solver
     converged = "converged" if solver.get("converged") else "DID NOT CONVERGE"
     loss = f"{solver.get('loss_function_type')} ({_number(solver.get('loss_function_scale'))} px)"
-    return [
+    in_scene = (sidecar.statistics.get("reference") or {}).get("residual") == "scene"
+    unit = "px^2" if not in_scene else "m^2" if sidecar.units.get("distance") == "metre" else "model units^2"
+    lines = [
         _row("Solver", f"{converged} after {solver.get('num_iterations')} iterations"),
         _row("Termination", str(solver.get("message", "")).strip()),
-        _row("Cost", f"{_number(solver.get('cost'), 6)} px^2, loss {loss}"),
-        _row("Gradient (largest entry)", f"{_number(solver.get('gradient_max_norm'))} px^2 per unit"),
-        _row("Still to gain by Newton's method", f"{_number(solver.get('newton_decrement'))} of the cost"),
+        _row("Cost", f"{_number(solver.get('cost'), 6)} {unit}, loss {loss}"),
+        _row("Gradient (largest entry)", f"{_number(solver.get('gradient_max_norm'))} {unit} per unit"),
     ]
+    decrement = solver.get("newton_decrement")
+    if decrement is not None and np.isfinite(decrement):
+        lines.append(_row("Still to gain by Newton's method", f"{_number(decrement)} of the cost"))
+    return lines
 
 
 def _range(values: Any, deviation: float | None) -> str:

@@ -52,5 +52,5 @@ def add_waves(sidecar: Sidecar, arrangement: Arrangement, soft: SoftSolution, sc
     }
     if soft.level is not None:
         waves["level_tilt_deg"] = float(np.degrees(soft.level.tilt))
-        waves["level_lift"] = soft.level.lift * typical
+        waves["level_lift"] = soft.level.lift
     sidecar.statistics["waves"] = waves

@@ -16,6 +16,7 @@ from colmap_refract.errors import RefractError, listed
 from colmap_refract.estimator import random_slopes
 from colmap_refract.estimator.chunk import Problem, robust_cost
 from colmap_refract.estimator.random_slopes import Deviations, KnownViews, Sights
+from colmap_refract.estimator.robust import LOSSES
 from colmap_refract.files.model_io import copy_model
 from colmap_refract.files.sidecar import Sidecar
 from colmap_refract.interface import Array
@@ -199,7 +200,7 @@ def _settled(
     """The points at rest, each on the side of the interfaces that it was taken to be on, if there is such a place."""
     points = points.copy()
     problem = _labelled(views, observations, points)
-    loss = random_slopes.LOSSES[options.loss_function_type]
+    loss = LOSSES[options.loss_function_type]
     num_restless = 0
     for _ in range(_RELABELLINGS):
         sights, known = _arrays(problem)
