@@ -14,6 +14,7 @@ import tyro
 from colmap_refract import __version__
 from colmap_refract.commands.automatic_reconstructor import AutomaticReconstructor
 from colmap_refract.commands.camera_calibrator import CameraCalibrator
+from colmap_refract.commands.experiments import Experiments
 from colmap_refract.commands.flow_matcher import FlowMatcher
 from colmap_refract.commands.image_selector import ImageSelector
 from colmap_refract.commands.initial_mapper import InitialMapper
@@ -55,6 +56,7 @@ def _registry() -> Any:
 _COMMANDS = {
     "automatic_reconstructor": AutomaticReconstructor,
     "camera_calibrator": CameraCalibrator,
+    "experiments": Experiments,
     "flow_matcher": FlowMatcher,
     "image_selector": ImageSelector,
     "initial_mapper": InitialMapper,

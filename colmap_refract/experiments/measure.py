@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from colmap_refract.errors import RefractError
 from colmap_refract.experiments.methods import Method
-from colmap_refract.experiments.results import Bound, Cloud, ExperimentResult, Finding, Run
+from colmap_refract.experiments.results import Bound, Cloud, ExperimentResult, Finding, Run, View
 from colmap_refract.experiments.scenes import Setup
 from colmap_refract.interface import Array
 from colmap_refract.simulation import bayesian_bound, noise_bound
@@ -26,7 +26,7 @@ class Plan:
     name: str
     title: str
     text: str
-    view: str
+    view: View
     outlier_limit: float
     methods: tuple[Method, ...]
     findings: tuple[Finding, ...]
@@ -67,7 +67,7 @@ def compare(plan: Plan, captured: Callable[[int], Sequence[Setup]], seeds: Seque
         name=plan.name,
         title=plan.title,
         text=plan.text,
-        view="plan" if plan.view == "plan" else "side",
+        view=plan.view,
         outlier_limit=plan.outlier_limit,
         scenarios=tuple(scenarios),
         methods=tuple(method.name for method in plan.methods if method.name in used),
@@ -129,7 +129,3 @@ def bound_of(setup: Setup, seed: int) -> Bound:
     rmse = bayesian_bound(capture) if setup.is_wavy else noise_bound(capture)
     rmse *= float(np.sqrt(capture.options.num_images / setup.capture.options.num_images))
     return Bound(scenario=setup.name, seed=seed, rmse=rmse)
-
-
-def names_of(methods: Iterable[Method]) -> tuple[str, ...]:
-    return tuple(method.name for method in methods)

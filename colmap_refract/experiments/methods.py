@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from colmap_refract.errors import RefractError
 from colmap_refract.experiments.scenes import Setup
-from colmap_refract.files.sidecar import ImageInterface, Sidecar
 from colmap_refract.interface import Array
-from colmap_refract.options import ImageNotes, RefinerOptions
-from colmap_refract.simulation import ignore_refraction
+from colmap_refract.options import BundleAdjustmentOptions, ImageNotes, RefinerOptions
+from colmap_refract.simulation import Capture, ignore_refraction
 
 if TYPE_CHECKING:
     import pycolmap
@@ -50,10 +50,18 @@ def points_of(model: pycolmap.Reconstruction) -> dict[int, Array]:
     return {point3D_id: np.array(point.xyz) for point3D_id, point in model.points3D.items()}
 
 
-def _refined(setup: Setup, options: RefinerOptions, notes: ImageNotes | None = None) -> Estimate:
+def _refined(
+    setup: Setup,
+    options: RefinerOptions,
+    *,
+    notes: ImageNotes | None = None,
+    start: pycolmap.Reconstruction | None = None,
+) -> Estimate:
     from colmap_refract.refiner.refinement import refine
 
-    result = refine(ignore_refraction(setup.capture), options, notes=notes)
+    # Sums of several threads differ in their last digits from run to run.
+    options = replace(options, num_threads=1)
+    result = refine(ignore_refraction(setup.capture) if start is None else start, options, notes=notes)
     remarks = [] if result.converged else ["not converged"]
     if options.interface_shape == "soft" and all(image.surface is None for image in result.sidecar.images.values()):
         remarks.append("no waves found, planes taken")
@@ -79,33 +87,93 @@ def _inclinations(setup: Setup) -> ImageNotes:
 
 
 def _tied(setup: Setup) -> Estimate:
-    return _refined(setup, RefinerOptions(scenario=setup.scenario), _inclinations(setup))
+    return _refined(setup, RefinerOptions(scenario=setup.scenario), notes=_inclinations(setup))
 
 
 def _averaged(setup: Setup) -> Estimate:
-    return _refined(setup, RefinerOptions(scenario=setup.scenario, average_groups=True), _inclinations(setup))
+    return _refined(setup, RefinerOptions(scenario=setup.scenario, average_groups=True), notes=_inclinations(setup))
+
+
+def _with_reference(setup: Setup) -> Estimate:
+    return _refined(setup, RefinerOptions(scenario=setup.scenario, reference_rays=True))
+
+
+def _printed(setup: Setup) -> Estimate:
+    model = ignore_refraction(setup.capture)
+    frames = sorted(model.frames)
+    few = frames[:: max(1, -(-len(frames) // _PRINTED_IMAGES))]
+    for frame_id in set(frames) - set(few):
+        model.deregister_frame(frame_id)
+    options = RefinerOptions(
+        scenario=setup.scenario,
+        interface_shape="soft_as_printed",
+        wave_slope_deg=setup.capture.options.wave_slope_deg,
+        pixel_noise=setup.capture.options.pixel_noise,
+        BundleAdjustment=BundleAdjustmentOptions(max_num_iterations=_PRINTED_ITERATIONS, function_tolerance=1e-6),
+    )
+    estimate = _refined(setup, options, start=model)
+    remarks = [f"{len(few)} images", *([estimate.remark] if estimate.remark else [])]
+    return replace(estimate, remark=", ".join(remarks))
 
 
 def _triangulated(setup: Setup) -> Estimate:
-    """Points alone, from the true poses and mean planes."""
-    from colmap_refract.triangulator.options import TriangulatorOptions
-    from colmap_refract.triangulator.triangulation import triangulate_points
+    from colmap_refract.comparators.methods import random_refractive_distortions
 
     capture = setup.capture
+    true = capture.reconstruction
     model = ignore_refraction(capture)
     for frame_id, frame in model.frames.items():
-        frame.rig_from_world = capture.reconstruction.frames[frame_id].rig_from_world
-    images = {
-        capture.reconstruction.image(image_id).name: ImageInterface(
-            image_id=image_id, normal_in_cam=(normal[0], normal[1], normal[2]), distance=distance
-        )
-        for image_id, (normal, distance) in capture.planes.items()
-    }
-    options = TriangulatorOptions(
-        slope_deviation_deg=capture.options.wave_slope_deg, pixel_noise=capture.options.pixel_noise
+        frame.rig_from_world = true.frames[frame_id].rig_from_world
+    found = random_refractive_distortions(
+        model,
+        {true.image(image_id).name: plane for image_id, plane in capture.planes.items()},
+        slope_deviation_deg=capture.options.wave_slope_deg,
+        layers=capture.layers,
+        pixel_noise=capture.options.pixel_noise,
     )
-    sidecar = Sidecar(scenario=capture.scenario, layers=capture.layers, images=images)
-    return Estimate(points=points_of(triangulate_points(model, sidecar, options).reconstruction))
+    return Estimate(points=points_of(found))
+
+
+def _turbulence(setup: Setup) -> Estimate:
+    from colmap_refract.comparators.methods import depth_from_turbulence
+
+    capture = setup.capture
+    mean = np.mean([normal for normal, _ in capture.planes.values()], axis=0)
+    found = depth_from_turbulence(
+        ignore_refraction(capture),
+        capture.reconstruction,
+        pixel_noise=capture.options.pixel_noise,
+        refractive_index=capture.layers.refractive_index,
+        normal_in_cam=mean,
+    )
+    return Estimate(points=points_of(found))
+
+
+def _from_refraction(setup: Setup, *, plane_known: bool) -> Estimate:
+    from colmap_refract.comparators.depth_from_refraction import find_plane_and_points, intersect_known_plane
+
+    if setup.dry is None:
+        raise RefractError(f"{setup.name}: there is no picture without water")
+    capture = setup.capture
+    first = min(capture.planes)
+    dry, wet = keypoints_of(setup.dry, 1), keypoints_of(capture, first)
+    ids = sorted(set(dry) & set(wet))
+    images = np.array([dry[i] for i in ids]), np.array([wet[i] for i in ids])
+    camera, noise = next(iter(capture.reconstruction.cameras.values())), capture.options.pixel_noise
+    if plane_known:
+        normal, distance = capture.planes[first]
+        found = intersect_known_plane(
+            *images, camera, normal_in_cam=normal, distance=distance, layers=capture.layers, pixel_noise=noise
+        )
+    else:
+        found = find_plane_and_points(*images, camera, layers=capture.layers, pixel_noise=noise)
+    return Estimate(points=dict(zip(ids, found.points, strict=True)))
+
+
+def keypoints_of(capture: Capture, image_id: int) -> dict[int, Array]:
+    """Keypoints (2,) of an image by the ids of their points."""
+    points2D = capture.reconstruction.image(image_id).points2D
+    return {point2D.point3D_id: np.array(point2D.xy) for point2D in points2D if point2D.has_point3D()}
 
 
 def never_fixed(setup: Setup) -> bool:
@@ -124,38 +192,76 @@ def wavy(setup: Setup) -> bool:
 IGNORED = Method(
     name="SfM",
     text="structure from motion that ignores refraction: COLMAP's bundle adjustment, intrinsics held",
-    given="a start: true poses and points, with noise of 1 %",
+    given="a start: the true poses and points with noise of 1 %",
     estimate=_ignored,
     suits=never_fixed,
 )
+TURBULENCE = Method(
+    name="DfT",
+    text="depth from turbulence, on refracted rays: what lies deeper wanders more",
+    given="the true points, for a scale and an offset; the mean normal of the surface; the keypoints' noise",
+    estimate=_turbulence,
+    suits=fixed,
+)
+REFRACTION = Method(
+    name="DfR",
+    text="depth from refraction: one image without water and one with, the interface found with the points",
+    given="an image without water; only one of the images with water",
+    estimate=partial(_from_refraction, plane_known=False),
+    suits=fixed,
+)
+REFRACTION_KNOWN = Method(
+    name="DfR, plane known",
+    text="the same with the interface known",
+    given="an image without water, and the true (mean) interface; only one of the images with water",
+    estimate=partial(_from_refraction, plane_known=True),
+    suits=fixed,
+)
+TRD = Method(
+    name="TRD",
+    text="triangulation in random refractive distortions (`point_triangulator`)",
+    given="the true poses and mean planes, the waves' slope and the keypoints' noise",
+    estimate=_triangulated,
+)
 HARD = Method(
     name="hard",
-    text="this package, flat interfaces, no reference image (`refiner`)",
-    given="the scenario, the index of water, and the result of SfM (fixed camera: points at one depth) to start from",
+    text="this package: flat interfaces, no reference image (`refiner`)",
+    given="the result of SfM to start from; with a fixed camera, points at one depth",
     estimate=_hard,
+)
+REFERENCE = Method(
+    name="hard, reference",
+    text="this package: flat interfaces, points on the rays of a reference image (`refiner --reference_rays 1`)",
+    given="as hard",
+    estimate=_with_reference,
+)
+PRINTED = Method(
+    name="soft as printed",
+    text="the paper's E_soft, a normal for every observation (`refiner --interface_shape soft_as_printed`)",
+    given="as hard; the waves' slope and the keypoints' noise, for its lambda; for its time, "
+    f"{_PRINTED_IMAGES} of the images at most and {_PRINTED_ITERATIONS} iterations",
+    estimate=_printed,
+    suits=wavy,
 )
 SOFT = Method(
     name="soft",
-    text="this package, a surface of waves per image (`refiner --interface_shape soft`)",
+    text="this package: a random surface of waves per image (`refiner --interface_shape soft`)",
     given="as hard",
     estimate=_soft,
     suits=wavy,
 )
-TRD = Method(
-    name="TRD",
-    text="triangulation in random refractive distortions, known poses (`point_triangulator`)",
-    given="the true poses and mean planes, the slope of the waves and the noise of the keypoints",
-    estimate=_triangulated,
-)
 TIED = Method(
     name="hard, shared planes",
-    text="hard, with one plane for all frames of an inclination",
+    text="hard, one plane for all frames of an inclination (`refiner --interface_group_path`)",
     given="as hard, and which frames share an inclination",
     estimate=_tied,
 )
 AVERAGED = Method(
     name="hard, averaged",
-    text="hard on the means of the keypoints of each inclination (`--average_groups 1`)",
+    text="hard, on the mean keypoints of each inclination (`refiner --average_groups 1`)",
     given="as hard, and which frames share an inclination",
     estimate=_averaged,
 )
+METHODS = (
+    IGNORED, TURBULENCE, REFRACTION, REFRACTION_KNOWN, TRD, HARD, REFERENCE, TIED, AVERAGED, PRINTED, SOFT,
+)  # fmt: skip

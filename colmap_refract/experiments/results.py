@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from colmap_refract.interface import Array
 
 Measure = Literal["rmse", "outliers"]
+View = Literal["plan", "side"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +109,7 @@ class ExperimentResult:
     title: str
     text: str
     """The set-up in words."""
-    view: Literal["plan", "side"]
+    view: View
     """How its clouds are drawn."""
     outlier_limit: float
     """Metres."""

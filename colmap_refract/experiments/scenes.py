@@ -1,7 +1,7 @@
 """The paper's set-ups: where board, bricks or table, camera and water stand, and what the camera then sees.
 
-The world is the simulation's: z points into the water, lengths are metres. A tank that is seen from its side lies on its
-back here; light does not know.
+The world is the simulation's: z points into the water, lengths are metres. A tank that is seen from its side lies on
+its back here; light does not know.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ PIXEL_NOISE = 0.22
 """Root mean square error of SIFT's keypoints on rendered pictures, px (benchmarks/results/photographs.md)."""
 CAMERA: dict[str, Any] = {"camera_model": "SIMPLE_RADIAL", "width": 1600, "height": 1200}
 """About that of a Point Grey Grasshopper 2."""
-_TELE, _NORMAL = 1800.0, 1200.0
-"""Focal lengths, px: of 8 mm and 5.3 mm on its sensor."""
+_TELE, _NORMAL = 1600.0, 1200.0
+"""Focal lengths, px: of 7 mm and 5.3 mm on its sensor."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,10 +141,12 @@ def _around(rng: np.random.Generator, count: int, reach: Array, target: Array) -
     centers = np.column_stack([radius * np.cos(azimuth), radius * np.sin(azimuth), rng.uniform(-1, 1, count)]) * reach
     aims = target + 0.02 * rng.standard_normal((count, 3))
     rolls = rng.uniform(-0.3, 0.3, count)
-    return [(looking_at(*pair, roll), pair[0]) for *pair, roll in zip(centers, aims, rolls, strict=True)]
+    return [(looking_at(place, aim, roll), place) for place, aim, roll in zip(centers, aims, rolls, strict=True)]
 
 
-def flat_setups(seed: int, *, markers: tuple[int, int] = (13, 10), images: tuple[int, int, int] = (15, 10, 10)) -> list[Setup]:
+def flat_setups(
+    seed: int, *, markers: tuple[int, int] = (13, 10), images: tuple[int, int, int] = (15, 10, 10)
+) -> list[Setup]:
     """A board in a tank that the camera sees through its front: fixed camera, static and moving interface.
 
     The board hangs 0.22 m behind the front, which is 0.5 m from the camera, turned by 10 to 20 degrees. A moving tank
@@ -175,9 +177,7 @@ def flat_setups(seed: int, *, markers: tuple[int, int] = (13, 10), images: tuple
     reach = np.array([0.25, 0.2, 0.05])
     options = SceneOptions(scenario="static_interface", num_images=static, **shared)
     normal, offset = tanks(1)[0]
-    stands = [
-        Stand(rotation=r, center=c, normal=normal, offset=offset) for r, c in _around(rng, static, reach, middle)
-    ]
+    stands = [Stand(rotation=r, center=c, normal=normal, offset=offset) for r, c in _around(rng, static, reach, middle)]
     setups.append(Setup(name="static interface", capture=photograph_stands(options, points, stands)))
 
     options = SceneOptions(scenario="moving_interface", num_images=moving, tilt_deg=8.0, **shared)
@@ -190,8 +190,12 @@ def flat_setups(seed: int, *, markers: tuple[int, int] = (13, 10), images: tuple
 
 
 def wavy_setups(
-    seed: int, *, markers: tuple[int, int] = (13, 10), inclinations: int = 5, images: tuple[int, int, int] = (20, 15, 20)
-) -> list[Setup]:  # fmt: skip
+    seed: int,
+    *,
+    markers: tuple[int, int] = (13, 10),
+    inclinations: int = 3,
+    images: tuple[int, int, int] = (20, 15, 20),
+) -> list[Setup]:
     """A board on the bottom of a tank, seen from above through waves of 0.1 to 0.3 m with slopes of 1.5 degrees (rms).
 
     The camera is 0.5 m above the water, which is 0.25 m deep. Fixed camera: a number of images at each of several
@@ -251,7 +255,9 @@ def brick_setup(seed: int, *, inclinations: int = 10, frames: int = 100, num_poi
         box_points(rng, middle, size, bottom, num_points // 4, yaw=rng.uniform(-0.6, 0.6)) for middle, bottom in places
     ]
     rest = num_points - sum(map(len, parts))
-    parts.append(np.column_stack([rng.uniform(-0.22, 0.22, rest), rng.uniform(-0.16, 0.16, rest), np.full(rest, floor)]))
+    parts.append(
+        np.column_stack([rng.uniform(-0.22, 0.22, rest), rng.uniform(-0.16, 0.16, rest), np.full(rest, floor)])
+    )
     points = np.concatenate(parts)
     count = inclinations * frames
     options = SceneOptions(
@@ -296,20 +302,27 @@ def pool_setups(seed: int, *, num_images: int = 20, num_points: int = 500) -> li
     bottom = POOL_LEVEL + POOL_DEPTH
     table = bottom - TABLE_HEIGHT
     share = num_points // 5
+
+    def plate(half: tuple[float, float], z: float, count: int) -> Array:
+        x, y = (rng.uniform(-side, side, count) for side in half)
+        return np.column_stack([x, y, np.full(count, z)])
+
     parts = [
-        np.column_stack([rng.uniform(-0.6, 0.6, 2 * share), rng.uniform(-0.4, 0.4, 2 * share), np.full(2 * share, table)]),
+        plate((0.6, 0.4), table, 2 * share),
         box_points(rng, (0.05, 0.0), (0.45, 0.35, BASKET_HEIGHT), table, share, yaw=0.2, lid=False),
         box_points(rng, (0.0, 0.05), (0.21, 0.10, 0.2), table, share // 2, yaw=0.9),
         box_points(rng, (0.1, -0.05), (0.21, 0.10, 0.13), table, share - share // 2, yaw=-0.5),
-        np.column_stack([rng.uniform(-0.8, 0.8, share), rng.uniform(-0.6, 0.6, share), np.full(share, bottom)]),
-    ]  # fmt: skip
+        plate((0.8, 0.6), bottom, share),
+    ]
     points = np.concatenate(parts)
     along = np.linspace(-0.6, 0.6, num_images)
     centers = np.column_stack([along, np.zeros(num_images), np.zeros(num_images)])
     centers += 0.01 * rng.standard_normal(centers.shape)
     aims = np.column_stack([0.5 * along, np.zeros(num_images), np.full(num_images, table)])
     aims[:, :2] += 0.04 * rng.standard_normal((num_images, 2))
-    rotations = [looking_at(c, a, r) for c, a, r in zip(centers, aims, 0.03 * rng.standard_normal(num_images), strict=True)]
+    rotations = [
+        looking_at(c, a, r) for c, a, r in zip(centers, aims, 0.03 * rng.standard_normal(num_images), strict=True)
+    ]
     level = np.array([0.0, 0.0, 1.0])
     stands = [
         Stand(rotation=r, center=c, normal=level, offset=POOL_LEVEL) for r, c in zip(rotations, centers, strict=True)
