@@ -14,12 +14,14 @@ import tyro
 from colmap_refract import __version__
 from colmap_refract.commands.automatic_reconstructor import AutomaticReconstructor
 from colmap_refract.commands.camera_calibrator import CameraCalibrator
+from colmap_refract.commands.dense_reconstructor import DenseReconstructor
 from colmap_refract.commands.experiments import Experiments
 from colmap_refract.commands.flow_matcher import FlowMatcher
 from colmap_refract.commands.image_selector import ImageSelector
 from colmap_refract.commands.initial_mapper import InitialMapper
 from colmap_refract.commands.model_analyzer import ModelAnalyzer
 from colmap_refract.commands.point_triangulator import PointTriangulator
+from colmap_refract.commands.poisson_mesher import PoissonMesher
 from colmap_refract.commands.refiner import Refiner
 from colmap_refract.commands.simulator import Simulator
 from colmap_refract.errors import RefractError
@@ -56,12 +58,14 @@ def _registry() -> Any:
 _COMMANDS = {
     "automatic_reconstructor": AutomaticReconstructor,
     "camera_calibrator": CameraCalibrator,
+    "dense_reconstructor": DenseReconstructor,
     "experiments": Experiments,
     "flow_matcher": FlowMatcher,
     "image_selector": ImageSelector,
     "initial_mapper": InitialMapper,
     "model_analyzer": ModelAnalyzer,
     "point_triangulator": PointTriangulator,
+    "poisson_mesher": PoissonMesher,
     "refiner": Refiner,
     "simulator": Simulator,
 }

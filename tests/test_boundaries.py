@@ -24,7 +24,7 @@ LAYERS = [
     {"files.model_files", "files.quiet"},
     {"files.text_files", "files.binary_files", "files.sidecar"},
     {"files.surface_files", "files.surface_picture"},
-    {"files.cameras_file", "files.output", "files.surfaces"},
+    {"files.cameras_file", "files.output", "files.point_cloud", "files.surfaces"},
     {"files.model_io"},
     {"estimator.rotation", "estimator.optics"},
     {"estimator.robust"},
@@ -102,6 +102,10 @@ LAYERS = [
     {"reconstructor.features", "reconstructor.flow", "reconstructor.matches", "reconstructor.models"},
     {"reconstructor.refined"},
     {"reconstructor.pipeline"},
+    {"dense.options", "dense.known_images", "dense.grid", "dense.neighbourhood"},
+    {"dense.choice", "dense.matching", "dense.triangulation", "dense.meshing"},
+    {"dense.reconstruction"},
+    {"dense.picture", "dense.report"},
     {
         "simulation.least_path", "simulation.surface", "simulation.ray_tracing", "simulation.stones",
         "simulation.point_elimination",
@@ -122,13 +126,15 @@ LAYERS = [
     {"experiments.methods", "experiments.charts"},
     {"experiments.measure", "experiments.tables"},
     {"experiments.flat", "experiments.wavy", "experiments.brick", "experiments.pool", "experiments.page"},
+    {"experiments.body"},
+    {"experiments.mannequin"},
     {"experiments.run"},
     {"commands.lists", "commands.progress"},
     {
-        "commands.automatic_reconstructor", "commands.camera_calibrator", "commands.experiments",
-        "commands.flow_matcher",
-        "commands.image_selector", "commands.initial_mapper", "commands.model_analyzer",
-        "commands.point_triangulator", "commands.refiner", "commands.simulator",
+        "commands.automatic_reconstructor", "commands.camera_calibrator", "commands.dense_reconstructor",
+        "commands.experiments", "commands.flow_matcher", "commands.image_selector", "commands.initial_mapper",
+        "commands.model_analyzer", "commands.point_triangulator", "commands.poisson_mesher", "commands.refiner",
+        "commands.simulator",
     },
     {"cli"},
     {"__main__"},
@@ -147,7 +153,7 @@ LIBRARIES = {
     },
     "matplotlib": {"experiments.charts"},
     "tyro": {"cli", "commands"},
-    "cv2": {"files.surface_picture", "photographs", "frame_selection", "optical_flow", "calibration"},
+    "cv2": {"files.surface_picture", "photographs", "frame_selection", "optical_flow", "calibration", "dense"},
 }  # fmt: skip
 """Which modules, or whole folders, may import a library at run time. For type checkers alone, everybody may."""
 

@@ -50,8 +50,20 @@ def triangulate(tracks: Tracks, structure: Structure, state: State, layers: Laye
     """
     origin, ray = refracted_rays(tracks, structure, state, layers)
     focal = np.linalg.norm(tracks.metric, axis=(1, 2)) / np.sqrt(2.0)
+    return nearest_to_rays(tracks.start, origin, ray, focal, fallback)
+
+
+def nearest_to_rays(start: NDArray[np.int64], origin: Array, ray: Array, focal: Array, fallback: Array) -> Array:
+    """Points (P, 3) nearest to their rays, robustly.
+
+    Args:
+        start: (P + 1,) first ray of each point.
+        origin, ray: (N, 3) in the world, the second unit; NaN for a ray that is not there.
+        focal: (N,) pixels per radian.
+        fallback: (P, 3) for points whose rays are parallel.
+    """
     points = fallback.copy()
-    _nearest_to_rays(tracks.start, origin, ray, focal, points)
+    _nearest_to_rays(start, origin, ray, focal, points)
     return points
 
 
@@ -152,8 +164,19 @@ def triangulation_angles(tracks: Tracks, structure: Structure, state: State, lay
     does not widen the angle.
     """
     origin, _ = refracted_rays(tracks, structure, state, layers)
+    return largest_angles(tracks.start, origin, points)
+
+
+def largest_angles(start: NDArray[np.int64], origin: Array, points: Array) -> Array:
+    """Largest angle (P,), degrees, between any two lines from origins (N, 3) to their point (P, 3).
+
+    Args:
+        start: (P + 1,) first origin of each point.
+        origin: NaN for a line that is not there.
+        points: of the origins.
+    """
     angles = np.empty(len(points))
-    _largest_angles(tracks.start, origin, points, angles)
+    _largest_angles(start, origin, points, angles)
     return np.degrees(angles)
 
 

@@ -83,8 +83,8 @@ def estimate(
     inverse = np.asarray(cv2.invertAffineTransform(affine), float)
     there: Array
     if method == "dense":
-        there = points + _dense(reference, frame, affine).at(points)
-        back = there + _dense(frame, reference, inverse).at(there)
+        there = points + dense_flow(reference, frame, affine).at(points)
+        back = there + dense_flow(frame, reference, inverse).at(there)
         found = np.ones(len(points), dtype=bool)
     else:
         there, forth = lucas_kanade(reference, frame, points, _mapped(affine, points), window_size, _LEVELS)
@@ -120,8 +120,13 @@ def lucas_kanade(
     return np.asarray(there, float), np.asarray(found).ravel() == 1
 
 
-def _dense(first: Gray, second: Gray, affine: Array) -> Field:
-    """Flow of the whole picture."""
+def dense_flow(first: Gray, second: Gray, affine: Array) -> Field:
+    """Flow of the whole picture, to about a pixel.
+
+    Args:
+        first, second: pictures of one size, levelled.
+        affine: map (2, 3) to begin from.
+    """
     height, width = first.shape
     first, second = shrink(first, _DENSE_SIDE), shrink(second, _DENSE_SIDE)
     y, x = np.mgrid[0 : first.shape[0], 0 : first.shape[1]]

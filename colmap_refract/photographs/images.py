@@ -60,6 +60,16 @@ def read_gray(path: Path) -> Gray:
     return _to_8_bit(_decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH))
 
 
+def read_rgb(path: Path) -> NDArray[np.uint8]:
+    """The colours of an image file, (H, W, 3) RGB, 16-bit and floating-point images scaled to 8 bit.
+
+    Raises:
+        RefractError: the file cannot be read.
+    """
+    bgr = _to_8_bit(_decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH))
+    return np.ascontiguousarray(bgr[..., ::-1])
+
+
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height of an image file, pixels, as stored. Decodes the file: it is known to be sound afterwards.
 

@@ -222,11 +222,18 @@ def _map(database_path: Path, image_path: Path, output_path: Path, options: Any)
     )
 
 
+def _mesh(input_path: Path, output_path: Path, options: dict[str, Any]) -> None:
+    import pycolmap
+
+    pycolmap.poisson_meshing(input_path, output_path, pycolmap.PoissonMeshingOptions(options))
+
+
 FUNCTIONS: dict[str, Callable[..., None]] = {
     "add_images": _add_images,
     "extract": _extract,
     "match": _match,
     "map": _map,
+    "mesh": _mesh,
 }
 
 
