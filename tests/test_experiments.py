@@ -206,7 +206,7 @@ def a_result(better: list[float], worse: list[float]) -> ExperimentResult:
         for seed, value in enumerate(values)
     ]  # fmt: skip
     return ExperimentResult(
-        name="x", title="X", text="", view="plan", outlier_limit=0.01, scenarios=("s",), methods=("a", "b"), runs=runs,
+        name="x", title="X", text="", view="plan", outlier_limit=0.01, scenarios=("s",), methods=("a", "b"), described=(), runs=runs,
         bounds=[Bound(scenario="s", seed=0, rmse=1e-3)],
     )  # fmt: skip
 

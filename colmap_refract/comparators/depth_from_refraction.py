@@ -204,9 +204,7 @@ def _most_likely(points: Array, direction: Array, metric: Array, normal: Array, 
     media = Media(layers)
     optics = Optics(media.ratio, media.ratio_by_index, media.walls)
     settled = points.copy()
-    random_slopes.settle(
-        settled, 0, count, sights, views, optics, Deviations(1.0, 0.0), LOSSES["trivial"], 1.0
-    )
+    random_slopes.settle(settled, 0, count, sights, views, optics, Deviations(1.0, 0.0), LOSSES["trivial"], 1.0)
     return settled
 
 

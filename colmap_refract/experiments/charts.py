@@ -189,3 +189,47 @@ def png(image: NDArray[np.uint8]) -> bytes:
     file = io.BytesIO()
     imsave(file, image, format="png", metadata=_METADATA["png"])
     return file.getvalue()
+
+
+def mesh_views(x: Array, y: Array, found: Array, errors: Array, colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A surface from above at an angle, textured and shaded, and its errors in plan, as a picture (H, W, 3).
+
+    Args:
+        x: (columns,), y: (rows,), found: (rows, columns) z, metres, not a number where there is no surface.
+        errors: (rows, columns) metres.
+        colours: (rows, columns, 3) RGB.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.colors import LightSource
+
+    figure = _figure(13.0, 4.2)
+    canvas = FigureCanvasAgg(figure)
+    coarse = max(1, round(max(found.shape) / 140))
+    part = np.s_[::coarse, ::coarse]
+    height = -found[part]
+    level = np.nan_to_num(height, nan=float(np.nanmin(height)))
+    shade = LightSource(azdeg=315, altdeg=45).shade_rgb(
+        np.full((*level.shape, 3), 0.8), level, dx=float(x[1] - x[0]) * coarse, dy=float(y[1] - y[0]) * coarse
+    )
+    across, along = np.meshgrid(x[::coarse], y[::coarse])
+    for k, (title, faces) in enumerate((("Textured", colours[part] / 255.0), ("Shaded", shade)), start=1):
+        axes: Any = figure.add_subplot(1, 3, k, projection="3d")
+        axes.plot_surface(across, along, height, facecolors=faces, rstride=1, cstride=1, shade=False, antialiased=False)
+        axes.set_box_aspect((float(np.ptp(x)), float(np.ptp(y)), float(np.nanmax(height) - np.nanmin(height))))
+        axes.view_init(elev=40, azim=-60)
+        axes.set_title(title, fontsize=10)
+        axes.set_xlabel("x [m]", fontsize=8)
+        axes.set_ylabel("y [m]", fontsize=8)
+        axes.set_zlabel("height [m]", fontsize=8)
+        axes.tick_params(labelsize=6)
+    axes = figure.add_subplot(1, 3, 3)
+    largest = max(1e-6, float(np.nanquantile(np.abs(1e3 * errors), 0.99)))
+    image = axes.pcolormesh(x, y, 1e3 * errors, cmap="RdBu_r", vmin=-largest, vmax=largest, rasterized=True)
+    axes.set_aspect("equal")
+    axes.set_title("Distance from the true surface", fontsize=10)
+    axes.set_xlabel("x [m]", fontsize=8)
+    axes.set_ylabel("y [m]", fontsize=8)
+    axes.tick_params(labelsize=7)
+    figure.colorbar(image, ax=axes, shrink=0.7).set_label("positive: too deep [mm]", fontsize=8)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[:, :, :3].copy()

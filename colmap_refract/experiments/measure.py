@@ -71,6 +71,7 @@ def compare(plan: Plan, captured: Callable[[int], Sequence[Setup]], seeds: Seque
         outlier_limit=plan.outlier_limit,
         scenarios=tuple(scenarios),
         methods=tuple(method.name for method in plan.methods if method.name in used),
+        described=tuple((m.name, m.text, m.given) for m in plan.methods if m.name in used),
         runs=runs,
         bounds=bounds,
         findings=plan.findings,

@@ -262,6 +262,3 @@ AVERAGED = Method(
     given="as hard, and which frames share an inclination",
     estimate=_averaged,
 )
-METHODS = (
-    IGNORED, TURBULENCE, REFRACTION, REFRACTION_KNOWN, TRD, HARD, REFERENCE, TIED, AVERAGED, PRINTED, SOFT,
-)  # fmt: skip

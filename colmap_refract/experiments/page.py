@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from colmap_refract.experiments import tables
-from colmap_refract.experiments.methods import Method
 from colmap_refract.experiments.results import ExperimentResult, judged
 
 TITLE = "The paper's experiments, simulated"
@@ -58,7 +57,6 @@ class Report:
     """Of the keypoints, px."""
     seeds: Sequence[int]
     results: Sequence[ExperimentResult]
-    methods: Sequence[Method]
     figures: Sequence[Figure]
 
     @property
@@ -76,7 +74,7 @@ class Report:
 def markdown(report: Report) -> str:
     """The tables, `results.md`."""
     parts = [f"# {TITLE}", f"    {report.command}", INTRO, "\n".join(f"- {fact}" for fact in report.facts)]
-    parts += ["## Methods", tables.markdown(tables.METHOD_HEADINGS, tables.method_rows(report.methods))]
+    parts += ["## Methods", tables.markdown(tables.METHOD_HEADINGS, tables.method_rows(report.results))]
     for result in report.results:
         parts += [f"## {result.title}", result.text]
         parts.append(tables.markdown(tables.outlier_heading(result), tables.rows(result)))
@@ -95,7 +93,7 @@ def page(report: Report) -> str:
     links = "".join(f'<li><a href="#{result.name}">{_text(result.title)}</a></li>' for result in report.results)
     parts.append(f"<nav><ul>{links}</ul></nav><h2>Methods</h2>")
     parts.append(
-        _table(tables.METHOD_HEADINGS, tables.method_rows(report.methods), "The methods and what they are given")
+        _table(tables.METHOD_HEADINGS, tables.method_rows(report.results), "The methods and what they are given")
     )
     for result in report.results:
         parts.append(f'<h2 id="{result.name}">{_text(result.title)}</h2><p>{_text(result.text)}</p>')

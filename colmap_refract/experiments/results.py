@@ -115,6 +115,8 @@ class ExperimentResult:
     """Metres."""
     scenarios: tuple[str, ...]
     methods: tuple[str, ...]
+    described: tuple[tuple[str, str, str], ...]
+    """Of every method its name, what it is, and what it is given."""
     runs: list[Run]
     bounds: list[Bound]
     findings: tuple[Finding, ...] = ()

@@ -54,21 +54,19 @@ def run(request: Request, say: Say) -> list[ExperimentResult]:
 
 def write(results: Sequence[ExperimentResult], request: Request, command: str, folder: Path, say: Say) -> None:
     """Write `index.html`, `results.md`, `results.json` and the figures into a folder that exists."""
-    from colmap_refract.experiments import charts, methods, page
+    from colmap_refract.experiments import charts, page
     from colmap_refract.experiments.scenes import PIXEL_NOISE
 
     figures = []
     for result in results:
         say(f"{result.name}: charts")
         figures += _figures(result)
-    used = {name for result in results for name in result.methods}
     report = page.Report(
         command=command,
         environment=_environment(),
         noise=PIXEL_NOISE,
         seeds=request.seeds,
         results=results,
-        methods=[method for method in methods.METHODS if method.name in used],
         figures=figures,
     )
     charts.check_matplotlib()

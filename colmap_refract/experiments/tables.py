@@ -6,7 +6,6 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from colmap_refract.experiments.methods import Method
 from colmap_refract.experiments.results import Case, ExperimentResult
 from colmap_refract.interface import Array
 
@@ -67,9 +66,9 @@ def remarks(result: ExperimentResult) -> list[str]:
     ]
 
 
-def method_rows(methods: Iterable[Method]) -> list[list[str]]:
-    """What each method is, and what it is given."""
-    return [[method.name, method.text, method.given] for method in methods]
+def method_rows(results: Iterable[ExperimentResult]) -> list[list[str]]:
+    """What each method is, and what it is given; once each."""
+    return [list(row) for row in dict.fromkeys(row for result in results for row in result.described)]
 
 
 METHOD_HEADINGS = ("method", "what it is", "what it is given besides keypoints, tracks, intrinsics and index")
