@@ -201,6 +201,7 @@ def mesh_views(x: Array, y: Array, found: Array, errors: Array, colours: NDArray
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.colors import LightSource
+    from matplotlib.ticker import MaxNLocator
 
     figure = _figure(13.0, 4.2)
     canvas = FigureCanvasAgg(figure)
@@ -220,7 +221,8 @@ def mesh_views(x: Array, y: Array, found: Array, errors: Array, colours: NDArray
         axes.set_title(title, fontsize=10)
         axes.set_xlabel("x [m]", fontsize=8)
         axes.set_ylabel("y [m]", fontsize=8)
-        axes.set_zlabel("height [m]", fontsize=8)
+        axes.set_zlabel("z [m]", fontsize=8)
+        axes.zaxis.set_major_locator(MaxNLocator(3))
         axes.tick_params(labelsize=6)
     axes = figure.add_subplot(1, 3, 3)
     largest = max(1e-6, float(np.nanquantile(np.abs(1e3 * errors), 0.99)))
@@ -231,5 +233,5 @@ def mesh_views(x: Array, y: Array, found: Array, errors: Array, colours: NDArray
     axes.set_ylabel("y [m]", fontsize=8)
     axes.tick_params(labelsize=7)
     figure.colorbar(image, ax=axes, shrink=0.7).set_label("positive: too deep [mm]", fontsize=8)
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[:, :, :3].copy()
+    canvas.draw()  # type: ignore[no-untyped-call]
+    return np.asarray(canvas.buffer_rgba())[:, :, :3].copy()  # type: ignore[no-untyped-call]

@@ -6,6 +6,7 @@ import shutil
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 
@@ -73,7 +74,6 @@ class _Outcome:
     surface: Surface | None = None
     photographs: tuple[NDArray[np.uint8], ...] = ()
     num_selected: int = 0
-    failure: str = ""
 
 
 def run(
@@ -83,12 +83,10 @@ def run(
     began = perf_counter()
     outcomes = []
     for number, seed in enumerate(seeds, start=1):
-        where = f"{NAME}, seed {number} of {len(seeds)}"
         session = swaying_tank(seed, num_frames=num_frames, width=width)
+        told = partial(_say_where, say, f"{NAME}, seed {number} of {len(seeds)}")
         with tempfile.TemporaryDirectory(prefix="colmap_refract-") as folder:
-            outcomes.append(
-                _whole_way(session, Path(folder), seed, num_images, lambda text, w=where: say(f"{w}: {text}"))
-            )
+            outcomes.append(_whole_way(session, Path(folder), seed, num_images, told))
     first = outcomes[0]
     limit = TOLERANCE * BODY_DEPTH
     facts = [Fact(text="Frames selected, the reference included", value=f"{first.num_selected} of {num_frames}")]
@@ -97,8 +95,8 @@ def run(
         verdict = "reached" if np.median(parts) >= WANTED else "missed"
         facts.append(
             Fact(
-                text=f"Mesh within {1e3 * limit:.1f} mm, {100 * TOLERANCE:g} % of the body's depth, of the true surface",
-                value=f"over {100 * np.median(parts):.1f} % of what the reference frame sees ({100 * min(parts):.1f} - "
+                text=f"Mesh within {1e3 * limit:.1f} mm ({100 * TOLERANCE:g} % of the body's depth) of the truth",
+                value=f"over {100 * np.median(parts):.1f} % of what the reference sees ({100 * min(parts):.1f} - "
                 f"{100 * max(parts):.1f}); {100 * WANTED:g} % wanted: {verdict}",
             )
         )
@@ -126,11 +124,19 @@ def run(
     )
 
 
+def _say_where(say: Say, where: str, text: str) -> None:
+    say(f"{where}: {text}")
+
+
 def _whole_way(session: Session, folder: Path, seed: int, num_images: int, say: Say) -> _Outcome:
     """Render, select, track, refine, make dense, mesh, and compare; what fails is said of all that follows."""
     runs: list[Run] = []
     began = perf_counter()
-    bound, clouds, surface, photographs, num_selected = None, [], None, (), 0
+    bound: Bound | None = None
+    clouds: list[Cloud] = []
+    surface: Surface | None = None
+    photographs: tuple[NDArray[np.uint8], ...] = ()
+    num_selected = 0
     try:
         reference, num_selected, photographs = _selected(session, folder, num_images, say)
         model_path = _refined(folder, reference, say)
@@ -171,7 +177,7 @@ def _whole_way(session: Session, folder: Path, seed: int, num_images: int, say: 
 def _selected(
     session: Session, folder: Path, num_images: int, say: Say
 ) -> tuple[str, int, tuple[NDArray[np.uint8], ...]]:
-    """Render all frames, and copy the selected ones into `chosen/`: the reference's name, how many, and three to show."""
+    """Render all, copy the selected into `chosen/`: the reference's name, their number, and three of them to show."""
     from colmap_refract.frame_selection.choice import select_frames
     from colmap_refract.frame_selection.options import SelectionOptions
     from colmap_refract.photographs.frames import ImageFolder
@@ -281,9 +287,8 @@ def _compared(session: Session, reference: str, vertices: Array, view: DenseView
 
     truth = session.truth
     camera = truth.view(reference).camera
-    column, row = np.meshgrid(
-        *(np.arange(view.margin, side - view.margin, 2) + 0.5 for side in (camera.width, camera.height))
-    )
+    sides = (camera.width, camera.height)
+    column, row = np.meshgrid(*(np.arange(view.margin, side - view.margin, 2) + 0.5 for side in sides))
     shown = truth.trace(reference, np.column_stack([column.ravel(), row.ravel()]))
     shown = shown[np.isfinite(shown).all(axis=1)]
     low, high = shown[:, :2].min(axis=0), shown[:, :2].max(axis=0)
@@ -312,7 +317,7 @@ def _pictures(first: _Outcome) -> list[Picture]:
         out.append(
             Picture(
                 name=f"{NAME}_photographs", image=frames,
-                text="Mannequin: the reference frame and two of the selected frames, whose water is tilted differently.",
+                text="Mannequin: the reference frame, and two of those selected, the water tilted differently.",
             )
         )  # fmt: skip
     if first.surface is not None:
@@ -320,7 +325,7 @@ def _pictures(first: _Outcome) -> list[Picture]:
         out.append(
             Picture(
                 name=f"{NAME}_mesh", image=charts.mesh_views(s.x, s.y, s.found, s.errors, s.colours),
-                text="Mannequin: the mesh, textured and shaded, and its distance from the true surface, mm; first seed.",
+                text="Mannequin: the mesh, textured and shaded, and its distance from the truth [mm]; the first seed.",
             )
         )  # fmt: skip
     return out
