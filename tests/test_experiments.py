@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from conftest import error_of
 from scipy.optimize import minimize
 
 from colmap_refract.cli import main
-from colmap_refract.experiments import flat, measure, methods, run, scenes, tables
+from colmap_refract.experiments import body, flat, mannequin, measure, methods, run, scenes, tables
 from colmap_refract.experiments.results import Bound, Case, ExperimentResult, Finding, Run, judged
 from colmap_refract.interface import Array
 from colmap_refract.simulation.scene import SceneOptions
@@ -139,6 +140,43 @@ def test_given_stations_and_waves_must_be_as_many_as_images() -> None:
     )
 
 
+def test_the_body_is_as_deep_as_it_is_said_to_be_and_its_water_sways() -> None:
+    session = body.swaying_tank(0, num_frames=120, width=160)
+    heights = session.truth.terrain.heights
+    assert heights.max() == pytest.approx(body.FLOOR)
+    assert heights.min() == pytest.approx(body.FLOOR - body.BODY_DEPTH)
+    # Nothing of it reaches the water, however that tilts.
+    normals = np.array([view.surface.normal for view in session.truth.views])
+    tilt = np.degrees(np.arccos(normals[:, 2]))
+    assert np.sqrt(np.mean(tilt**2)) == pytest.approx(8.0, rel=0.02)
+    lowest = body.LEVEL + 0.01 + 0.5 * np.tan(np.radians(tilt.max()))
+    assert heights.min() > lowest
+    # A camera at rest: nothing but the water moves.
+    assert len({view.cam_from_world.tobytes() for view in session.truth.views}) == 1
+    first, later = normals[0], normals[5]
+    assert np.degrees(np.arccos(first @ later)) > 1
+
+
+def test_a_mesh_that_is_moved_along_the_view_is_off_by_that_and_holes_are_no_mesh() -> None:
+    session = body.swaying_tank(0, num_frames=2, width=160)
+    terrain = session.truth.terrain
+    x, y = np.meshgrid(np.arange(-0.4, 0.4, 0.002), np.arange(-0.3, 0.3, 0.002))
+    places = np.column_stack([x.ravel(), y.ravel()])
+    vertices = np.column_stack([places, terrain.height(places) + 0.001])
+    vertices = vertices[np.linalg.norm(vertices[:, :2], axis=1) > 0.05]
+    view = SimpleNamespace(margin=8, colours=np.full((len(vertices), 3), 7, np.uint8))
+    found = mannequin._compared(session, "frame_0001.jpg", vertices, view, vertices)
+    assert found.seen.mean() > 0.9
+    errors = found.errors[found.seen]
+    hole = np.pi * (0.05 - mannequin._GAP) ** 2 / (found.seen.sum() * (found.x[1] - found.x[0]) ** 2)
+    assert np.isnan(errors).mean() == pytest.approx(hole, rel=0.2)
+    # Moved along z, so by less along the normal of a slope; a chord between vertices is off by some 0.01 mm.
+    x, y = np.meshgrid(found.x, found.y)
+    kept = found.seen & np.isfinite(found.errors) & (np.hypot(x, y) > 0.055)
+    steepness = np.linalg.norm(terrain.gradient(np.column_stack([x[kept], y[kept]])), axis=1)
+    np.testing.assert_allclose(found.errors[kept] * np.hypot(1, steepness), 1e-3, atol=5e-5)
+
+
 # --- Measuring. ---
 
 
@@ -206,8 +244,8 @@ def a_result(better: list[float], worse: list[float]) -> ExperimentResult:
         for seed, value in enumerate(values)
     ]  # fmt: skip
     return ExperimentResult(
-        name="x", title="X", text="", view="plan", outlier_limit=0.01, scenarios=("s",), methods=("a", "b"), described=(), runs=runs,
-        bounds=[Bound(scenario="s", seed=0, rmse=1e-3)],
+        name="x", title="X", text="", view="plan", outlier_limit=0.01, scenarios=("s",), methods=("a", "b"),
+        described=(), runs=runs, bounds=[Bound(scenario="s", seed=0, rmse=1e-3)],
     )  # fmt: skip
 
 
@@ -217,6 +255,7 @@ def test_what_differs_from_the_paper_is_said() -> None:
     )
     assert judged(finding, a_result([1e-3], [2e-3])) == "The paper: a is better than b. Here, too: 1 against 2 mm."
     assert "otherwise: 2 against 1 mm" in judged(finding, a_result([2e-3], [1e-3]))
+    assert "hardly differ: 1 against 1.02 mm" in judged(finding, a_result([1e-3], [1.02e-3]))
     assert "cannot be told" in judged(finding, a_result([np.nan], [1e-3]))
 
 

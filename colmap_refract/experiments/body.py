@@ -44,16 +44,12 @@ def torso() -> Terrain:
 
 
 def slopes(num_frames: int, rng: np.random.Generator) -> Array:
-    """Slopes (n, 2) of the water in a swaying tank: two oscillations of other periods, and how far it rises (n,)."""
+    """Slopes (n, 2) of the water in a swaying tank: along each axis an oscillation that swells and fades."""
     phase = rng.uniform(0, 2 * np.pi, 4)
-    t = np.arange(num_frames)
-    steepest = np.sqrt(2) * np.tan(np.radians(_TILT_DEG)) / np.sqrt(2)
-    return np.column_stack(
-        [
-            steepest * np.sin(2 * np.pi * t / 37.0 + phase[0]) * (0.8 + 0.2 * np.sin(2 * np.pi * t / 160 + phase[2])),
-            steepest * np.sin(2 * np.pi * t / 29.0 + phase[1]) * (0.8 + 0.2 * np.sin(2 * np.pi * t / 130 + phase[3])),
-        ]
-    )
+    t = 2 * np.pi * np.arange(num_frames)
+    swell = [0.8 + 0.2 * np.sin(t / period + phase[2 + k]) for k, period in enumerate((160, 130))]
+    swaying = np.column_stack([swell[k] * np.sin(t / period + phase[k]) for k, period in enumerate((37, 29))])
+    return np.asarray(swaying * np.tan(np.radians(_TILT_DEG)) / np.sqrt(np.mean(np.sum(swaying**2, axis=1))))
 
 
 def swaying_tank(seed: int, *, num_frames: int = 240, width: int = 640) -> Session:

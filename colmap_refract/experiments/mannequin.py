@@ -104,8 +104,8 @@ def run(
         name=NAME,
         title="Mannequin",
         text=(
-            f"A rounded body, {1e3 * BODY_DEPTH:g} mm deep, on the bottom of a tank under 0.4 m of water; the camera is "
-            "fixed to the tank, 0.45 m above the water, whose surface is plane and tilts by 8 degrees (root mean "
+            f"A rounded body, {1e3 * BODY_DEPTH:g} mm deep, on the bottom of a tank under 0.4 m of water; the camera "
+            "is fixed to the tank, 0.45 m above the water, whose surface is plane and tilts by 8 degrees (root mean "
             f"square) while the tank sways. {num_frames} rendered frames of {width} x {3 * width // 4} px, of which "
             f"{num_images - 1} and a reference are selected by their optical flow. The bound of the sparse points is "
             "that of their measured noise; the dense points have none."
@@ -292,11 +292,12 @@ def _compared(session: Session, reference: str, vertices: Array, view: DenseView
     shown = truth.trace(reference, np.column_stack([column.ravel(), row.ravel()]))
     shown = shown[np.isfinite(shown).all(axis=1)]
     low, high = shown[:, :2].min(axis=0), shown[:, :2].max(axis=0)
-    spacing = 0.003
+    # As dense as what was traced.
+    spacing = float(np.sqrt(np.prod(high - low) / len(shown)))
     x, y = (np.arange(low[k], high[k], spacing) for k in range(2))
     grid = np.stack(np.meshgrid(x, y), axis=-1)
     places = grid.reshape(-1, 2)
-    seen = KDTree(shown[:, :2]).query(places)[0] < spacing
+    seen = KDTree(shown[:, :2]).query(places)[0] < 1.5 * spacing
     true = np.where(seen, truth.terrain.height(places), np.nan)
     found = LinearNDInterpolator(vertices[:, :2], vertices[:, 2])(places)
     found[KDTree(vertices[:, :2]).query(places)[0] > _GAP] = np.nan

@@ -13,6 +13,9 @@ from colmap_refract.interface import Array
 Measure = Literal["rmse", "outliers"]
 View = Literal["plan", "side"]
 
+_SAME = 0.05
+"""Relative difference of medians that nothing is concluded from."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
@@ -152,6 +155,8 @@ def judged(finding: Finding, result: ExperimentResult) -> str:
         return f"The paper: {finding.text}. Here it cannot be told: one of the two did not run or failed."
     unit, scale = ("mm", 1e3) if finding.measure == "rmse" else ("% of the points", 1e2)
     figures = f"{scale * better:.3g} against {scale * worse:.3g} {unit}"
+    if abs(better - worse) < _SAME * max(better, worse):
+        return f"The paper: {finding.text}. Here they hardly differ: {figures}."
     if better < worse:
         return f"The paper: {finding.text}. Here, too: {figures}."
     return f"The paper: {finding.text}. Here it is otherwise: {figures}."
