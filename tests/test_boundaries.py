@@ -122,7 +122,7 @@ LAYERS = [
     {"simulation.plan"},
     {"simulation.plan_report"},
     {"simulation"},
-    {"experiments.scenes", "experiments.results"},
+    {"experiments.scenes", "experiments.results", "experiments.parallel"},
     {"experiments.methods", "experiments.charts"},
     {"experiments.measure", "experiments.tables"},
     {"experiments.flat", "experiments.wavy", "experiments.brick", "experiments.pool", "experiments.page"},

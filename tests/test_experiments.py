@@ -10,6 +10,7 @@ import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,8 +21,9 @@ from conftest import error_of
 from scipy.optimize import minimize
 
 from colmap_refract.cli import main
-from colmap_refract.experiments import body, flat, mannequin, measure, methods, run, scenes, tables
-from colmap_refract.experiments.results import Bound, Case, ExperimentResult, Finding, Run, judged
+from colmap_refract.errors import RefractError
+from colmap_refract.experiments import body, flat, mannequin, measure, methods, parallel, run, scenes, tables
+from colmap_refract.experiments.results import Bound, Case, ExperimentResult, Fact, Finding, Run, judged, merged
 from colmap_refract.interface import Array
 from colmap_refract.simulation.scene import SceneOptions
 
@@ -170,11 +172,11 @@ def test_a_mesh_that_is_moved_along_the_view_is_off_by_that_and_holes_are_no_mes
     errors = found.errors[found.seen]
     hole = np.pi * (0.05 - mannequin._GAP) ** 2 / (found.seen.sum() * (found.x[1] - found.x[0]) ** 2)
     assert np.isnan(errors).mean() == pytest.approx(hole, rel=0.2)
-    # Moved along z, so by less along the normal of a slope; a chord between vertices is off by some 0.01 mm.
+    # Moved along z, so by less along the normal of a slope; a chord between vertices is off by less than 0.1 mm.
     x, y = np.meshgrid(found.x, found.y)
     kept = found.seen & np.isfinite(found.errors) & (np.hypot(x, y) > 0.055)
     steepness = np.linalg.norm(terrain.gradient(np.column_stack([x[kept], y[kept]])), axis=1)
-    np.testing.assert_allclose(found.errors[kept] * np.hypot(1, steepness), 1e-3, atol=5e-5)
+    np.testing.assert_allclose(found.errors[kept] * np.hypot(1, steepness), 1e-3, atol=1e-4)
 
 
 # --- Measuring. ---
@@ -231,6 +233,38 @@ def test_a_thinned_capture_has_the_bound_of_the_whole() -> None:
     thinned = measure.bound_of(whole, 0).rmse
     direct = measure.bound_of(replace(whole, thinned=None), 0).rmse
     assert thinned == pytest.approx(direct, rel=1e-3)
+
+
+def doubled(value: int, say: Callable[[str], None]) -> int:
+    say(f"doubling {value}")
+    if value < 0:
+        raise RefractError(f"{value} is negative: give another")
+    return 2 * value
+
+
+def test_tasks_beside_each_other_keep_their_order_and_their_words() -> None:
+    said: list[str] = []
+    tasks = [partial(doubled, value) for value in range(5)]
+    assert parallel.together(tasks, 2, said.append) == [0, 2, 4, 6, 8]
+    assert any("doubling" in text for text in said)
+    assert parallel.together(tasks, 1, said.append) == [0, 2, 4, 6, 8]
+    assert "-1 is negative" in error_of(lambda: parallel.together([partial(doubled, v) for v in (1, -1)], 2, quiet))
+
+
+def test_results_of_seeds_make_one(small: ExperimentResult) -> None:
+    parts = [
+        replace(
+            small, runs=[r for r in small.runs if r.seed == seed], bounds=[b for b in small.bounds if b.seed == seed],
+            facts=[Fact(text="t", value=f"{seed}")],
+        )
+        for seed in SEEDS
+    ]  # fmt: skip
+    whole = merged(parts)
+    for case in {(r.scenario, r.method) for r in small.runs}:
+        key = Case(scenario=case[0], method=case[1])
+        np.testing.assert_array_equal(whole.values(key), small.values(key))
+    assert [whole.bound(s) for s in small.scenarios] == [small.bound(s) for s in small.scenarios]
+    assert whole.facts == [Fact(text="t", value="0; 1")]
 
 
 # --- What is said. ---
@@ -346,6 +380,7 @@ def test_charts_are_the_same_for_the_same_result(small: ExperimentResult) -> Non
         (("--only", ","), "no experiment is named"),
         (("--seeds", "0"), "seeds 0"),
         (("--seeds", "-2"), "seeds -2"),
+        (("--num_threads", "0"), "num_threads 0"),
     ],
 )
 def test_what_makes_no_sense_is_one_clear_line(
@@ -367,7 +402,7 @@ def test_the_command_writes_all_or_nothing(
 ) -> None:
     pytest.importorskip("matplotlib")
     out = tmp_path / "out"
-    command = ["experiments", "--output_path", str(out), "--only", "flat", "--seeds", "2"]
+    command = ["experiments", "--output_path", str(out), "--only", "flat", "--seeds", "2", "--num_threads", "1"]
 
     def interrupted() -> ExperimentResult:
         raise KeyboardInterrupt

@@ -24,13 +24,17 @@ class Experiments:
     """Which experiments, their names separated by commas."""
     seeds: int = 5
     """Captures of each set-up, drawn anew."""
+    num_threads: int = -1
+    """Captures that are measured at once, a process each; -1: as many as there are cores."""
     overwrite: bool = False
     """Replace a report that is at output_path."""
 
     def run(self) -> None:
         """Simulate, measure, report."""
         request = Request(
-            only=tuple(name.strip() for name in self.only.split(",") if name.strip()), num_seeds=self.seeds
+            only=tuple(name.strip() for name in self.only.split(",") if name.strip()),
+            num_seeds=self.seeds,
+            num_threads=self.num_threads,
         )
         from colmap_refract.experiments import page
         from colmap_refract.experiments.charts import check_matplotlib

@@ -84,7 +84,7 @@ def run(
     outcomes = []
     for number, seed in enumerate(seeds, start=1):
         session = swaying_tank(seed, num_frames=num_frames, width=width)
-        told = partial(_say_where, say, f"{NAME}, seed {number} of {len(seeds)}")
+        told = partial(_say_where, say, NAME if len(seeds) == 1 else f"{NAME}, {number} of {len(seeds)}")
         with tempfile.TemporaryDirectory(prefix="colmap_refract-") as folder:
             outcomes.append(_whole_way(session, Path(folder), seed, num_images, told))
     first = outcomes[0]
@@ -95,9 +95,9 @@ def run(
         verdict = "reached" if np.median(parts) >= WANTED else "missed"
         facts.append(
             Fact(
-                text=f"Mesh within {1e3 * limit:.1f} mm ({100 * TOLERANCE:g} % of the body's depth) of the truth",
-                value=f"over {100 * np.median(parts):.1f} % of what the reference sees ({100 * min(parts):.1f} - "
-                f"{100 * max(parts):.1f}); {100 * WANTED:g} % wanted: {verdict}",
+                text=f"Mesh within {1e3 * limit:.1f} mm ({100 * TOLERANCE:g} % of the body's depth) of the truth, over "
+                f"what the reference frame sees ({100 * WANTED:g} % wanted)",
+                value=f"{100 * np.median(parts):.1f} %, {verdict}",
             )
         )
     return ExperimentResult(

@@ -47,7 +47,7 @@ def compare(plan: Plan, captured: Callable[[int], Sequence[Setup]], seeds: Seque
     clouds: list[Cloud] = []
     scenarios: list[str] = []
     for number, seed in enumerate(seeds, start=1):
-        where = f"{plan.name}, seed {number} of {len(seeds)}"
+        where = plan.name if len(seeds) == 1 else f"{plan.name}, {number} of {len(seeds)}"
         say(f"{where}: photographing")
         for setup in captured(seed):
             if setup.name not in scenarios:

@@ -67,7 +67,7 @@ class Report:
             f"Seeds: {listed}. Keypoints have {self.noise:g} px of noise per axis, the root mean square error of SIFT "
             "on rendered pictures, where an experiment does not start from pictures.",
             f"{self.environment}.",
-            *(f"{result.title}: {result.seconds:.0f} s in all." for result in self.results),
+            *(f"{result.title}: {result.seconds:.0f} s, all seeds, one process." for result in self.results),
         ]
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -146,6 +147,21 @@ class ExperimentResult:
         """The median over the seeds."""
         values = [bound.rmse for bound in self.bounds if bound.scenario == scenario]
         return float(np.median(values)) if values else np.nan
+
+
+def merged(parts: Sequence[ExperimentResult]) -> ExperimentResult:
+    """One experiment of several seeds, from a result of each; clouds and pictures are those of the first."""
+    facts: dict[str, list[str]] = {}
+    for part in parts:
+        for fact in part.facts:
+            facts.setdefault(fact.text, []).append(fact.value)
+    return replace(
+        parts[0],
+        runs=[run for part in parts for run in part.runs],
+        bounds=[bound for part in parts for bound in part.bounds],
+        facts=[Fact(text=text, value="; ".join(dict.fromkeys(values))) for text, values in facts.items()],
+        seconds=sum(part.seconds for part in parts),
+    )
 
 
 def judged(finding: Finding, result: ExperimentResult) -> str:

@@ -7,6 +7,7 @@ import math
 import platform
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -14,7 +15,9 @@ from typing import Any
 
 from colmap_refract.errors import RefractError
 from colmap_refract.experiments.measure import Say
-from colmap_refract.experiments.results import ExperimentResult
+from colmap_refract.experiments.parallel import together
+from colmap_refract.experiments.results import ExperimentResult, merged
+from colmap_refract.machine import threads
 
 EXPERIMENTS = ("flat", "wavy", "mannequin", "brick", "pool")
 """Names, and modules of this folder with a `run(seeds, say)` each."""
@@ -27,6 +30,8 @@ class Request:
 
     only: tuple[str, ...] = EXPERIMENTS
     num_seeds: int = 5
+    num_threads: int = -1
+    """Captures that are measured at once."""
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.only if name not in EXPERIMENTS]
@@ -36,6 +41,8 @@ class Request:
             raise RefractError(f"no experiment is named: choose among {', '.join(EXPERIMENTS)}")
         if self.num_seeds < 1:
             raise RefractError(f"seeds {self.num_seeds} is no number of captures: give 1 or more")
+        if self.num_threads == 0 or self.num_threads < -1:
+            raise RefractError(f"num_threads {self.num_threads}: give 1 or more, or -1 for one per core")
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -47,9 +54,18 @@ def experiment(name: str) -> Experiment:
     return import_module(f"colmap_refract.experiments.{name}").run  # type: ignore[no-any-return]
 
 
+def one_seed(name: str, seed: int, say: Say) -> ExperimentResult:
+    """An experiment on one capture of each of its set-ups."""
+    return experiment(name)((seed,), lambda text: say(f"{text} (seed {seed})"))
+
+
 def run(request: Request, say: Say) -> list[ExperimentResult]:
     """The results, each experiment once, in the paper's order."""
-    return [experiment(name)(request.seeds, say) for name in EXPERIMENTS if name in request.only]
+    names = [name for name in EXPERIMENTS if name in request.only]
+    order = [(name, seed) for seed in request.seeds for name in names]
+    done = together([partial(one_seed, name, seed) for name, seed in order], threads(request.num_threads), say)
+    parts = dict(zip(order, done, strict=True))
+    return [merged([parts[name, seed] for seed in request.seeds]) for name in names]
 
 
 def write(results: Sequence[ExperimentResult], request: Request, command: str, folder: Path, say: Say) -> None:
@@ -125,10 +141,4 @@ def _numbers(result: ExperimentResult) -> dict[str, Any]:
 
 def _environment() -> str:
     libraries = ", ".join(f"{name} {version(name)}" for name in ("pycolmap", "pyceres", "numpy", "numba"))
-    return f"Python {platform.python_version()}, {libraries}; {_cores()} cores"
-
-
-def _cores() -> int:
-    from colmap_refract.machine import threads
-
-    return threads(-1)
+    return f"Python {platform.python_version()}, {libraries}; {threads(-1)} cores"
