@@ -124,7 +124,7 @@ class RefinerRequest:
     """The paper's lambda, with soft_as_printed: what the normals' differences weigh, in px^2 (with
     residual scene, in squared units of the model). None suits all scenes, so there is no default, but
     wave_slope_deg s gives one: 2 sigma^2 / ((m - 1) s^2), with the pixel_noise sigma and m keypoints in a
-    neighbourhood. Right for waves shorter than that, too little for longer ones."""
+    neighbourhood. That is for waves shorter than a neighbourhood; for longer ones give wavelength, too."""
     wave_radius: float | None = None
     """Of the neighbourhoods among whose keypoints normals are alike, px, with soft_as_printed.
     By default they hold about ten keypoints."""
@@ -133,7 +133,7 @@ class RefinerRequest:
     soft_as_printed; otherwise it is estimated."""
     wavelength: float | None = None
     """Length of the waves, in metres if interface_distance is given, otherwise in units of the model.
-    With soft; estimated by default."""
+    With soft; estimated by default. With soft_as_printed it makes wave_smoothness what it should be."""
     num_wave_modes: int = 36
     """Unknowns of each image's surface, with soft: its most probable shapes.
     What they cannot take counts as noise."""

@@ -48,7 +48,7 @@ LAYERS = [
     {"refiner.wave_statistics"},
     {"refiner.soft", "refiner.solution"},
     {"refiner.outcome", "refiner.wave_output", "refiner.plane_solution"},
-    {"refiner.soft_solution", "refiner.reference_solution"},
+    {"refiner.soft_solution", "refiner.reference_solution", "refiner.own_normals"},
     {"refiner.printed_solution"},
     {"refiner.refinement"},
     {"refiner.held_out"},

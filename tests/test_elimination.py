@@ -296,7 +296,7 @@ def test_what_ceres_is_told_is_the_reduced_system(case: str, loss: Loss) -> None
     parameters = some_parameters(chunk, 1e-3)
     cost, gradient, matrix = reduced(chunk, parameters)
 
-    block = adjustment._ReducedCost(chunk, None, adjustment._Watch(None, len(problem.tracks.image), problem.state))
+    block = adjustment._ReducedCost(chunk, None, adjustment.SolverWatch(None, len(problem.tracks.image)))
     n = chunk.num_columns
     residual = np.full(n + 1, np.nan)
     told = [np.full((n + 1) * width, np.nan) for width in chunk.widths]
@@ -312,7 +312,7 @@ def test_what_ceres_is_told_is_the_reduced_system(case: str, loss: Loss) -> None
     # Blocks that Ceres holds constant come without memory for their derivatives.
     some: list[Array | None] = [None if k % 2 else part for k, part in enumerate(told)]
     assert block.Evaluate(parameters, residual, some)
-    assert block.watch.exception is None
+    assert not block.watch.errors
 
 
 @pytest.mark.parametrize("loss", ["trivial", "cauchy"])

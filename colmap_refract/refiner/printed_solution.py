@@ -1,8 +1,8 @@
 """The soft constraint as the paper prints it, from a level start: a normal for every observation.
 
 What it finds are poses, points and normals. Beside the model an image has one plane: that of its mean normal through
-the mean of where its rays meet the water. Keypoints of points that the reference does not see take the mean normal of their
-neighbours, and the points go where those rays meet.
+the mean of where its rays meet the water. Keypoints of points that the reference does not see take the mean normal of
+their neighbours, and the points go where those rays meet.
 """
 
 from __future__ import annotations
@@ -11,31 +11,35 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.special import j0
 
 from colmap_refract.errors import RefractError
 from colmap_refract.estimator.adjustment import Adjustment, SolverSettings, settle_points
 from colmap_refract.estimator.chunk import Problem
+from colmap_refract.estimator.neighbours import neighbour_weights
 from colmap_refract.estimator.printed_terms import pixel_weights
 from colmap_refract.estimator.printed_unknowns import Pairing, blocks_at_start, pair, points_in_reference
 from colmap_refract.estimator.scenario import Index
 from colmap_refract.estimator.soft_as_printed import PrintedAdjustment, adjust_as_printed
 from colmap_refract.files.sidecar import Sidecar
-from colmap_refract.interface import Array, tangent_basis
 from colmap_refract.refiner.arrangement import Arrangement
-from colmap_refract.refiner.continuation import Watch, is_sound, named, residuals, retriangulate
+from colmap_refract.refiner.continuation import Watch, is_sound, named, residuals
 from colmap_refract.refiner.filtering import Filtered, filter_observations, reprojection_errors
+from colmap_refract.refiner.own_normals import everywhere, slope_deviation
 from colmap_refract.refiner.reference_solution import SHRUNK, check_reference, poorly_tied
 from colmap_refract.refiner.selection import Selection
-from colmap_refract.refiner.soft import level_start
+from colmap_refract.refiner.soft import level_start, wave_options
 from colmap_refract.refiner.soft_solution import check_waves
 from colmap_refract.refiner.solution import Solution, from_scratch
 from colmap_refract.refiner.uncertainty import Uncertainty
 
 MOST_UNKNOWNS = 60_000
-"""Some 25 000 observations. An iteration evaluates each in Python, and hundreds may be needed."""
+"""Some 25 000 observations. An iteration, of which hundreds may be needed, evaluates each through Python: seconds."""
 _FUNCTION_TOLERANCE = 1e-6
 """The planes are such weak directions that less than this ends at no place that is any better."""
 _NEIGHBOURS = 10
+_SHORT = 1e-9
+"""A wavelength over which no two keypoints' normals are alike."""
 _WIDE = 4.0
 """Times the median residual at the start, which is mostly waves: the scale of the loss."""
 
@@ -80,7 +84,7 @@ def solve_as_printed(
         settings=replace(settings, function_tolerance=max(settings.function_tolerance, _FUNCTION_TOLERANCE)),
         on_progress=named(watch, "Soft constraint as printed"),
     )
-    flat, wavy = _everywhere(begin, printed, observations.pixel, radius)
+    flat, wavy = everywhere(begin, printed, observations.pixel, radius)
     if printed.termination == "failure" or not is_sound(flat):
         raise RefractError(
             SHRUNK if options.residual == "scene" else
@@ -98,7 +102,7 @@ def solve_as_printed(
     selection = Selection(arrangement=arrangement, problem=flat, keep=keep, marks=marks)
     active, problem = selection.active()
     kept = selection.keep_point
-    deviation = _slope_deviation(wavy, np.isfinite(printed.normals[:, 0]))
+    deviation = slope_deviation(wavy, np.isfinite(printed.normals[:, 0]))
 
     def describe(sidecar: Sidecar, scale: float) -> None:
         of_residual = scale**2 if options.residual == "scene" else 1.0
@@ -141,7 +145,7 @@ def _check_size(arrangement: Arrangement, pairing: Pairing) -> None:
     if unknowns > MOST_UNKNOWNS:
         raise RefractError(
             f"soft_as_printed would have {unknowns} unknowns, a normal for each of {len(pairing.others)} observations; "
-            f"more than {MOST_UNKNOWNS} take too long: use interface_shape soft"
+            f"more than {MOST_UNKNOWNS} take hours: use interface_shape soft"
         )
 
 
@@ -163,86 +167,47 @@ def _radius(arrangement: Arrangement, rows: Index) -> float:
 
 
 def _smoothness(arrangement: Arrangement, begin: Problem, pairing: Pairing, radius: float) -> float:
-    """The paper's `lambda` in units of the solve: the user's, or what noise and slopes make of it."""
+    """The paper's `lambda` in units of the solve: the user's, or what noise and waves make of it.
+
+    It weighs the data against the regulariser `R` as probabilities do, if it is `2 n sigma^2 / E(R)` with `n` normals.
+    Normals differ by `E|n_k - n_l|^2 = 2 s^2 (1 - rho)`, where `rho` is `J0` of their distance over the wavelength for
+    waves from all sides, and 0 if nothing is said of it: then `E(R) = n (m - 1) s^2`.
+    """
     options, observations = arrangement.options, arrangement.observations
     if options.wave_smoothness is not None:
         return options.wave_smoothness / (arrangement.unit**2 if options.residual == "scene" else 1.0)
     assert options.wave_slope_deg is not None
     rows = np.concatenate([pairing.of_reference, pairing.others])
-    sizes = []
+    rows = rows[begin.tracks.wet[rows]]
+    normal, distance = begin.state.planes_in_cam(begin.structure)
+    expected, free = 0.0, 0
     for i in np.unique(observations.image[rows]).tolist():
-        pixels = observations.pixel[rows[observations.image[rows] == i]]
-        sizes.append(cKDTree(pixels).query_ball_point(pixels, radius, return_length=True))
-    others = float(np.concatenate(sizes).mean()) - 1.0
-    if not others > 0:
+        mine = rows[observations.image[rows] == i]
+        pairs = neighbour_weights(observations.pixel[mine], radius).tocoo()
+        ray = observations.direction[mine]
+        foot = ray / (ray @ normal[i])[:, None]
+        apart = np.linalg.norm(foot[pairs.row] - foot[pairs.col], axis=1)
+        alike = j0(2.0 * np.pi * apart / _wavelength(arrangement, float(distance[i])))
+        expected += float(pairs.data @ (2.0 * (1.0 - alike)))
+        free += 2 * (len(mine) - 1)
+    if not expected > 0:
         raise RefractError(f"wave_radius {radius:g} px holds no neighbours of any keypoint: give a larger one")
     noise = options.pixel_noise * (_units_per_pixel(begin, pairing) if options.residual == "scene" else 1.0)
-    return float(2.0 * noise**2 / (others * np.tan(np.radians(options.wave_slope_deg)) ** 2))
+    return float(free * noise**2 / (expected * np.tan(np.radians(options.wave_slope_deg)) ** 2))
+
+
+def _wavelength(arrangement: Arrangement, distance: float) -> float:
+    """Over an interface's distance, in units of the solve; next to nothing if it is not given."""
+    given = wave_options(arrangement)
+    if given.wavelength is not None:
+        return given.wavelength
+    return _SHORT if given.wavelength_in_depths is None else given.wavelength_in_depths / distance
 
 
 def _units_per_pixel(problem: Problem, pairing: Pairing) -> float:
     """How far apart in the scene a point and a ray typically are for an error of a pixel, units of the solve."""
     points = points_in_reference(problem, problem.state, pairing, blocks_at_start(problem, pairing))
     return float(np.median(1.0 / np.linalg.norm(pixel_weights(problem, pairing, points), ord=2, axis=(1, 2))))
-
-
-def _everywhere(begin: Problem, printed: PrintedAdjustment, keypoints: Array, radius: float) -> tuple[Problem, Problem]:
-    """All observations at the solution, with each image's mean plane, and with normals of their own."""
-    tracks, structure = begin.tracks, begin.structure
-    normal, distance = printed.state.planes_in_cam(structure)
-    image = tracks.image
-    known = np.isfinite(printed.normals[:, 0])
-    own = np.where(known[:, None], printed.normals, normal[image])
-    for i in np.unique(image[known]).tolist():
-        here, wanting = np.flatnonzero(known & (image == i)), np.flatnonzero(~known & tracks.wet & (image == i))
-        tree = cKDTree(keypoints[here])
-        nearest = tree.query(keypoints[wanting])[1]
-        for k, near, first in zip(
-            wanting.tolist(), tree.query_ball_point(keypoints[wanting], radius), nearest.tolist(), strict=True
-        ):
-            own[k] = own[here[near or [first]]].mean(axis=0)
-    # One coefficient, of value 1, whose shape on the surface is each keypoint's own slope, without any height.
-    axes = np.zeros((structure.num_images, 3, 2))
-    refracted = structure.image_plane >= 0
-    axes[refracted] = [tangent_basis(n) for n in normal[refracted]]
-    slopes = np.einsum("nia,ni->na", axes[image], own) / np.einsum("ni,ni->n", own, normal[image])[:, None]
-    waves = np.zeros((len(image), 3, 1))
-    waves[:, 1:, 0] = np.where(refracted[image][:, None], slopes, 0.0)
-    points = np.where(np.isfinite(printed.points), printed.points, begin.points)
-    at = replace(begin, state=printed.state, points=points, held=replace(begin.held, waves=True))
-    wavy = replace(
-        at,
-        tracks=tracks._replace(waves=waves, sight=tracks.direction.copy()),
-        structure=replace(structure, wave_axes=axes),
-        state=replace(at.state, waves=np.ones((structure.num_images, 1))),
-    )
-    return _with_mean_planes(at, own, known), replace(wavy, points=retriangulate(wavy).points)
-
-
-def _with_mean_planes(problem: Problem, own: Array, known: Array) -> Problem:
-    """Planes of the mean of the normals `own` (N, 3) that are `known`, through the mean of where the rays meet them."""
-    structure, state, image = problem.structure, problem.state, problem.tracks.image
-    rotation, translation = state.cam_from_world(structure)
-    cam_normal, cam_distance = state.planes_in_cam(structure)
-    with np.errstate(invalid="ignore"):
-        ray = problem.tracks.direction
-        reach = cam_distance[image] / np.einsum("ni,ni->n", ray, cam_normal[image])
-    place = reach[:, None] * ray
-    normal, distance = state.normal.copy(), state.distance.copy()
-    for block in range(structure.num_planes):
-        mine = np.flatnonzero(known & (structure.image_plane[image] == block))
-        if not len(mine):
-            continue
-        normals, places, anchor = own[mine], place[mine], np.zeros(3)
-        if structure.plane_in_world[block]:
-            turn = rotation[image[mine]]
-            normals = np.einsum("nji,nj->ni", turn, normals)
-            places = np.einsum("nji,nj->ni", turn, places - translation[image[mine]])
-            anchor = structure.plane_anchor[block]
-        mean = normals.mean(axis=0)
-        normal[block] = mean / np.linalg.norm(mean)
-        distance[block] = normal[block] @ (places.mean(axis=0) - anchor)
-    return replace(problem, state=replace(state, normal=normal, distance=distance))
 
 
 def _filter(arrangement: Arrangement, flat: Problem, wavy: Problem) -> Filtered:
@@ -255,13 +220,6 @@ def _filter(arrangement: Arrangement, flat: Problem, wavy: Problem) -> Filtered:
     if options.filter_max_reproj_error > 0:
         large = reprojection_errors(wavy, arrangement.observations) > options.filter_max_reproj_error
     return replace(angles, keep=angles.keep & ~large, num_large_error=int(large.sum()))
-
-
-def _slope_deviation(wavy: Problem, known: Array) -> float:
-    """Root mean square slope of the recovered normals about the mean of their image's, degrees."""
-    slopes, image = wavy.tracks.waves[known, 1:, 0], wavy.tracks.image[known]
-    squares = [((slopes[image == i] - slopes[image == i].mean(axis=0)) ** 2).sum(axis=1) for i in np.unique(image)]
-    return float(np.degrees(np.arctan(np.sqrt(np.concatenate(squares).mean()))))
 
 
 def _as_adjustment(printed: PrintedAdjustment) -> Adjustment:
