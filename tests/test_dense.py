@@ -154,6 +154,14 @@ def test_points_lie_on_the_ground(dense: dict[str, tuple[Workspace, list[DenseVi
     assert view.num_covered == 0 and len(view.points) + removed == view.num_nodes == view.depth.size
 
 
+def test_large_images_are_matched_in_copies(moving: Workspace) -> None:
+    (view,) = moving.reconstruct(replace(OPTIONS, max_image_size=199, step=2))
+    # 199 by 149: the two ratios differ.
+    assert view.picture.shape == (149, 199, 3)
+    assert np.median(np.abs(moving.off(view.points))) < 2 * LIMITS["moving"][0]
+    assert abs(np.median(moving.off(view.points))) < 0.3 * LIMITS["moving"][0]
+
+
 @pytest.mark.parametrize("capture", LIMITS)
 def test_normals_point_up_from_the_ground(dense: dict[str, tuple[Workspace, list[DenseView]]], capture: str) -> None:
     workspace, (view,) = dense[capture]
@@ -413,6 +421,10 @@ def test_bad_input_to_the_mesher_is_told_in_a_line(tmp_path: Path) -> None:
     assert "no normal" in error(cloud("nan.ply", 500, facing=np.zeros(xyz.shape)))
     assert "at one place" in error(cloud("same.ply", 500, points=np.zeros(xyz.shape)))
     assert "smaller --PoissonMeshing.trim" in error(whole, trim=12.0, depth=6)
+    deeper = tmp_path / "new" / "folder" / "mesh.ply"
+    options = PoissonMeshingOptions(trim=12.0, depth=6)
+    assert "smaller" in error_of(lambda: poisson_mesh(whole, deeper, options))
+    assert not (tmp_path / "new").exists()
     assert "depth 99" in error_of(lambda: PoissonMeshingOptions(depth=99))
     assert not out.exists()
     assert "is the input" in error_of(lambda: poisson_mesh(whole, whole, PoissonMeshingOptions(), overwrite=True))
@@ -423,7 +435,8 @@ def test_bad_input_to_the_mesher_is_told_in_a_line(tmp_path: Path) -> None:
 
 def test_options_that_make_no_sense_are_told() -> None:
     for name, value in (
-        ("num_references", 0), ("max_num_images", 0), ("step", 1000), ("window_size", 3), ("max_error", 0.0),
+        ("num_references", 0), ("max_num_images", 0), ("step", 1000),
+        ("max_image_size", 50), ("window_size", 3), ("max_error", 0.0),
         ("min_correlation", 1.0), ("min_num_views", 1), ("max_reproj_error", 0.0), ("min_tri_angle", -1.0),
         ("max_depth_error", 0.0),
     ):  # fmt: skip

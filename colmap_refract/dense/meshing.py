@@ -11,6 +11,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -79,6 +80,7 @@ def poisson_mesh(
     trim = options.trim if options.trim is not None else max(0.0, round(level - _COARSER, 1))
     say(f"Meshing {len(points)} points ...")
     work = None
+    missing = [parent for parent in output_path.resolve().parents if not parent.exists()]
     try:
         output_path.parent.mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix=WORK_PREFIX, dir=output_path.parent))
@@ -104,6 +106,10 @@ def poisson_mesh(
     finally:
         if work is not None:
             shutil.rmtree(work, ignore_errors=True)
+        if not output_path.exists():
+            for folder in missing:
+                with suppress(OSError):
+                    folder.rmdir()
     return Mesh(num_points=len(points), depth=depth, trim=trim, num_vertices=count)
 
 

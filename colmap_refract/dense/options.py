@@ -11,6 +11,7 @@ MOST_NODES = 250_000
 """Of the grid, where the step is not given."""
 _FINEST_STEP = 2
 _DEEPEST = 16
+_LEAST_SIZE = 100
 _MIN_ANGLE_DEG, _MIN_ANGLE_FIXED_DEG = 0.5, 0.05
 
 
@@ -24,6 +25,9 @@ class DenseOptions:
     """Images whose grids are matched, one after the other, each where the ones before have left no points."""
     max_num_images: int = 16
     """Images that a reference is matched with, at most: those that share most points with it at a good angle."""
+    max_image_size: int = 2000
+    """Larger images are matched in copies of so many pixels along their longer side; step and the limits of matches
+    count the copies' pixels."""
     step: int = 0
     """Between the nodes of the grid. 0: 2, or more in large images, so that there are 250 000 nodes at most."""
     window_size: int = 15
@@ -46,6 +50,8 @@ class DenseOptions:
         for name in ("num_references", "max_num_images"):
             if getattr(self, name) < 1:
                 raise RefractError(f"{name} {getattr(self, name)} is too few: give 1 or more")
+        if self.max_image_size < _LEAST_SIZE:
+            raise RefractError(f"max_image_size {self.max_image_size} is too small: give {_LEAST_SIZE} or more pixels")
         if not (self.step == 0 or 1 <= self.step <= 100):
             raise RefractError(f"step {self.step} is not from 1 to 100 pixels, nor 0, for what the size asks for")
         if not 5 <= self.window_size <= 101:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +22,7 @@ from colmap_refract.files.sidecar import Sidecar
 from colmap_refract.interface import Array
 from colmap_refract.optical_flow.frame import MIN_TRACKS
 from colmap_refract.optical_flow.reference import check_names
-from colmap_refract.photographs.images import Gray
+from colmap_refract.photographs.images import Gray, shrink
 
 if TYPE_CHECKING:
     import pycolmap
@@ -45,7 +46,7 @@ class DenseView:
         num_nodes: of the grid; num_covered: that had points of earlier references, and were left out.
         num_unmatched: found in too few images; num_large_error: fit too few of those that they were found in;
             num_small_angle, num_far_off: removed for that.
-        picture: (H, W, 3) RGB, the reference image.
+        picture: (H, W, 3) RGB, the reference image, or the copy of it that was matched.
         step, margin: of the grid.
         depth: (rows, columns) along the camera's axis, model units; NaN where there is no point.
         points, normals: (n, 3), world. colours: (n, 3) RGB.
@@ -153,26 +154,35 @@ def _from_reference(
                 f"image '{name}' has {gray.shape[1]} x {gray.shape[0]} pixels, its camera in the model "
                 f"{camera.width} x {camera.height}; give the images that the model was made from"
             )
-        return gray
+        return shrink(gray, options.max_image_size)
+
+    def ratio(image: int, gray: Gray) -> Array:
+        """Pixels of an image per pixel of its copy, (2,): x and y are rounded each by itself."""
+        camera = images.camera(image)
+        return np.array([camera.width, camera.height]) / gray.shape[::-1]
 
     name = images.names[reference]
     first = read(reference)
+    own_ratio = ratio(reference, first)
     height, width = first.shape
     grid = Grid(width=width, height=height, step=options.step_for(width, height), margin=options.half_window + 1)
-    covered = _covered(images, reference, grid, known)
+    covered = _covered(images, reference, grid, own_ratio, known)
     nodes = grid.nodes
     pixels = np.full((1 + len(neighbours), len(nodes), 2), np.nan, dtype=np.float32)
-    pixels[0] = np.where(covered[:, None], np.nan, nodes) + _OPENCV_TO_COLMAP
+    pixels[0] = np.where(covered[:, None], np.nan, (nodes + _OPENCV_TO_COLMAP) * own_ratio)
     sparse = images.sparse
     seen = np.unique(sparse.point[sparse.image == reference])
     points = sparse.points[seen]
-    places = images.project(reference, points) - _OPENCV_TO_COLMAP
+    places = images.project(reference, points) / own_ratio - _OPENCV_TO_COLMAP
     for m, neighbour in enumerate(neighbours):
         say(f"Matching '{name}': image {m + 1} of {len(neighbours)}")
-        predicted = predict(places, images.project(neighbour, points) - _OPENCV_TO_COLMAP, width, height)
+        frame = read(neighbour)
+        its_ratio = ratio(neighbour, frame)
+        others = images.project(neighbour, points) / its_ratio - _OPENCV_TO_COLMAP
+        predicted = predict(places, others, width, height)
         if predicted is not None:
-            found = match(first, read(neighbour), grid, predicted, options)
-            pixels[1 + m] = np.where(covered[:, None], np.nan, found) + _OPENCV_TO_COLMAP
+            found = match(first, frame, grid, predicted, options)
+            pixels[1 + m] = np.where(covered[:, None], np.nan, (found + _OPENCV_TO_COLMAP) * its_ratio)
     members = [reference, *neighbours]
     dense = _triangulated(images, members, pixels, options, say)
     del pixels
@@ -185,12 +195,12 @@ def _from_reference(
     near = near_median(depth.reshape(grid.shape), options.max_depth_error).ravel()
     on_grid = np.where((kept & near)[:, None], dense.points, np.nan)
     # The rays' direction at the points: what is seen faces it.
-    rays = images.rays(reference, nodes + _OPENCV_TO_COLMAP)
+    rays = images.rays(reference, (nodes + _OPENCV_TO_COLMAP) * own_ratio)
     facing = normals(on_grid.reshape(*grid.shape, 3), np.nan_to_num(rays.ray).reshape(*grid.shape, 3)).reshape(-1, 3)
     good = np.flatnonzero(kept & near & np.isfinite(facing).all(axis=1))
     left = np.full(len(nodes), np.nan)
     left[good] = depth[good]
-    picture = read_colours(name)
+    picture = shrink(read_colours(name), options.max_image_size)
     column, row = nodes[good].astype(np.int64).T
     return DenseView(
         name=name,
@@ -234,17 +244,19 @@ def _triangulated(
     )
 
 
-def _covered(images: KnownImages, reference: int, grid: Grid, known: Array) -> Mask:
-    """Which nodes have a known point nearer than a step."""
+def _covered(images: KnownImages, reference: int, grid: Grid, ratio: Array, known: Array) -> Mask:
+    """Which nodes have a known point nearer than a step, or lie between such nodes."""
     rows, columns = grid.shape
     result = np.zeros((rows, columns), dtype=np.bool_)
     if not len(known):
         return result.ravel()
     with np.errstate(invalid="ignore"):
-        place = (images.project(reference, known) - _OPENCV_TO_COLMAP - grid.margin) / grid.step
+        place = (images.project(reference, known) / ratio - _OPENCV_TO_COLMAP - grid.margin) / grid.step
         # What is behind the camera projects as well.
         place[images.in_cam(reference, known)[:, 2] <= 0] = np.nan
         inside = ((place > -0.5) & (place < np.array([columns, rows]) - 0.5)).all(axis=1)
     column, row = np.rint(place[inside]).astype(np.int64).T
     result[row, column] = True
-    return result.ravel()
+    # A node between covered ones is covered, too: alone it would have no neighbours to be judged by.
+    closed = cv2.morphologyEx(result.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    return np.asarray(closed.ravel() > 0)

@@ -118,11 +118,14 @@ def common_size(by_size: dict[tuple[int, int], list[str]]) -> tuple[int, int]:
 
 
 def shrink(gray: Gray, side: int) -> Gray:
-    """A copy whose longer side has `side` pixels, each the mean of those that it covers; a smaller picture as it is."""
-    scale = side / max(gray.shape)
+    """A copy (H, W) or (H, W, 3) whose longer side has `side` pixels, each the mean of those that it covers.
+
+    A smaller picture stays as it is.
+    """
+    scale = side / max(gray.shape[:2])
     if scale >= 1:
         return gray
-    height, width = (max(1, round(length * scale)) for length in gray.shape)
+    height, width = (max(1, round(length * scale)) for length in gray.shape[:2])
     return np.asarray(cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
