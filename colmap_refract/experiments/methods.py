@@ -108,6 +108,8 @@ def _printed(setup: Setup) -> Estimate:
         scenario=setup.scenario,
         interface_shape="soft_as_printed",
         wave_slope_deg=setup.capture.options.wave_slope_deg,
+        # The start has the truth's size, but for a per cent.
+        wavelength=float(np.sqrt(np.prod(setup.capture.options.wavelength))),
         pixel_noise=setup.capture.options.pixel_noise,
         BundleAdjustment=BundleAdjustmentOptions(max_num_iterations=_PRINTED_ITERATIONS, function_tolerance=1e-6),
     )
@@ -238,7 +240,7 @@ REFERENCE = Method(
 PRINTED = Method(
     name="soft as printed",
     text="the paper's E_soft, a normal for every observation (`refiner --interface_shape soft_as_printed`)",
-    given="as hard; the waves' slope and the keypoints' noise, for its lambda; for its time, "
+    given="as hard; the waves' slope and length and the keypoints' noise, for its lambda; for its time, "
     f"{_PRINTED_IMAGES} of the images at most and {_PRINTED_ITERATIONS} iterations",
     estimate=_printed,
     suits=wavy,

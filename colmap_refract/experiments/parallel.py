@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import queue
 import signal
+import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -44,26 +45,26 @@ def together(tasks: Sequence[Task[T]], num_processes: int, say: Say) -> list[T]:
     context = multiprocessing.get_context("spawn")
     words = context.Queue()
     workers: set[int] = set()
-    executor = ProcessPoolExecutor(
-        min(num_processes, len(tasks)), mp_context=context, initializer=_begin, initargs=(words,)
-    )
-    try:
-        futures = [executor.submit(_do, task) for task in tasks]
-        _watch(futures, words, workers, say)
-        results = [future.result() for future in futures]
-    except BrokenProcessPool:
-        raise RefractError(
-            "a process of the experiments was killed: is there memory enough? Use --num_threads 1"
-        ) from None
-    except BaseException:
-        executor.shutdown(wait=False, cancel_futures=True)
-        for pid in workers:
-            with suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGTERM)
-        raise
-    finally:
-        executor.shutdown(wait=False, cancel_futures=True)
-    return results
+    with tempfile.TemporaryDirectory(prefix="colmap_refract-", ignore_cleanup_errors=True) as scratch:
+        executor = ProcessPoolExecutor(
+            min(num_processes, len(tasks)), mp_context=context, initializer=_begin, initargs=(words, scratch)
+        )
+        try:
+            futures = [executor.submit(_do, task) for task in tasks]
+            _watch(futures, words, workers, say)
+            return [future.result() for future in futures]
+        except BrokenProcessPool:
+            raise RefractError(
+                "a process of the experiments was killed: is there memory enough? Use --num_threads 1"
+            ) from None
+        except BaseException:
+            # What they have in hand is of no use any more, and their files are in the folder that goes now.
+            for pid in workers:
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+            raise
+        finally:
+            executor.shutdown(wait=False, cancel_futures=True)
 
 
 def _watch(futures: Sequence[Future[T]], words: Any, workers: set[int], say: Say) -> None:
@@ -81,12 +82,15 @@ def _watch(futures: Sequence[Future[T]], words: Any, workers: set[int], say: Say
                     say(f"{len(futures) - len(pending)} of {len(futures)} captures done; {text}")
 
 
-def _begin(words: Any) -> None:
+def _begin(words: Any, scratch: str) -> None:
     """In a new worker."""
     global _words
     _words = words
-    # The parent says what there is to say of an interruption.
-    signal.signal(signal.SIGINT, lambda *_: os._exit(1))
+    tempfile.tempdir = scratch
+    # Of what is not loaded yet: only what is fatal. What matters comes as an exception.
+    os.environ["GLOG_minloglevel"] = "3"
+    # The parent ends the workers when it is interrupted.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     words.put((os.getpid(), ""))
 
 

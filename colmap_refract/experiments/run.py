@@ -56,7 +56,10 @@ def experiment(name: str) -> Experiment:
 
 def one_seed(name: str, seed: int, say: Say) -> ExperimentResult:
     """An experiment on one capture of each of its set-ups."""
-    return experiment(name)((seed,), lambda text: say(f"{text} (seed {seed})"))
+    from colmap_refract.files.quiet import quiet_pycolmap
+
+    with quiet_pycolmap():
+        return experiment(name)((seed,), lambda text: say(f"{text} (seed {seed})"))
 
 
 def run(request: Request, say: Say) -> list[ExperimentResult]:
