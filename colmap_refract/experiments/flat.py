@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from colmap_refract.experiments import methods
-from colmap_refract.experiments.measure import Plan, Say, compare
+from colmap_refract.experiments.measure import Plan, compare
+from colmap_refract.experiments.parallel import Say
 from colmap_refract.experiments.results import Case, ExperimentResult, Finding
 from colmap_refract.experiments.scenes import flat_setups
 

@@ -17,7 +17,7 @@ from colmap_refract.dense.reconstruction import DenseView
 from colmap_refract.errors import RefractError
 from colmap_refract.experiments import charts
 from colmap_refract.experiments.body import BODY_DEPTH, swaying_tank
-from colmap_refract.experiments.measure import Say
+from colmap_refract.experiments.parallel import Say
 from colmap_refract.experiments.results import Bound, Cloud, ExperimentResult, Fact, Picture, Run
 from colmap_refract.interface import Array
 from colmap_refract.optical_flow.options import FlowOptions

@@ -10,13 +10,12 @@ import numpy as np
 
 from colmap_refract.errors import RefractError
 from colmap_refract.experiments.methods import Method
+from colmap_refract.experiments.parallel import Say
 from colmap_refract.experiments.results import Bound, Cloud, ExperimentResult, Finding, Run, View
 from colmap_refract.experiments.scenes import Setup
 from colmap_refract.interface import Array
 from colmap_refract.simulation import bayesian_bound, noise_bound
 from colmap_refract.simulation.accuracy import align
-
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, kw_only=True)

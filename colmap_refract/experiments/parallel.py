@@ -88,7 +88,7 @@ def _begin(words: Any, scratch: str) -> None:
     _words = words
     tempfile.tempdir = scratch
     # Of what is not loaded yet: only what is fatal. What matters comes as an exception.
-    os.environ["GLOG_minloglevel"] = "3"  # noqa: SIM112: its own spelling
+    os.environ["GLOG_minloglevel"] = "3"  # noqa: SIM112
     # The parent ends the workers when it is interrupted.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     words.put((os.getpid(), ""))

@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from colmap_refract.errors import RefractError
-from colmap_refract.experiments.measure import Say
-from colmap_refract.experiments.parallel import together
+from colmap_refract.experiments.parallel import Say, together
 from colmap_refract.experiments.results import ExperimentResult, merged
 from colmap_refract.machine import threads
 
