@@ -27,20 +27,19 @@ from colmap_refract.simulation.judge import judge
 from colmap_refract.simulation.session import Session, write_session
 from colmap_refract.simulation.truth import CAMERAS_NAME
 
-NAME, SCENARIO = "mannequin", "fixed camera"
-SPARSE, DENSE, MESH = "hard, sparse points", "hard, dense points", "hard, mesh"
+NAME, METHOD = "mannequin", "hard, from pictures"
+SPARSE, DENSE, MESH = "sparse points", "dense points", "mesh"
 TOLERANCE = 0.01
 """Of the body's depth: how near the mesh is to be, over `WANTED` of what is seen."""
 WANTED = 0.95
 _GAP = 0.012
 """Metres from a place to the nearest vertex beyond which there is no mesh there."""
 _DESCRIBED = (
-    (SPARSE, "this package: frames selected, tracked by optical flow, refined (`image_selector`, `flow_matcher`, "
-     "`refiner`)", "the pictures alone, and the camera's intrinsics"),
-    (DENSE, "every second pixel of the reference frame, matched and triangulated (`dense_reconstructor`)", "as before"),
-    (MESH, "Poisson mesh of the dense points (`poisson_mesher`), compared over all the reference frame sees",
-     "as before"),
-)  # fmt: skip
+    METHOD,
+    "this package, the whole way: `image_selector`, `flow_matcher`, `refiner`, then every second pixel of the "
+    "reference frame by `dense_reconstructor` and a mesh by `poisson_mesher`",
+    "the pictures alone",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,13 +107,13 @@ def run(
             "is fixed to the tank, 0.45 m above the water, whose surface is plane and tilts by 8 degrees (root mean "
             f"square) while the tank sways. {num_frames} rendered frames of {width} x {3 * width // 4} px, of which "
             f"{num_images - 1} and a reference are selected by their optical flow. The bound of the sparse points is "
-            "that of their measured noise; the dense points have none."
+            "that of their measured noise."
         ),
         view="side",
         outlier_limit=limit,
-        scenarios=(SCENARIO,),
-        methods=(SPARSE, DENSE, MESH),
-        described=_DESCRIBED,
+        scenarios=(SPARSE, DENSE, MESH),
+        methods=(METHOD,),
+        described=(_DESCRIBED,),
         runs=[run for outcome in outcomes for run in outcome.runs],
         bounds=[outcome.bound for outcome in outcomes if outcome.bound is not None],
         clouds=list(first.clouds),
@@ -148,7 +147,7 @@ def _whole_way(session: Session, folder: Path, seed: int, num_images: int, say: 
         aligned, best = align_to_best(found, true)
         runs.append(_run(DENSE, seed, aligned, true, view.coverage, perf_counter() - began))
         some = slice(None, None, max(1, len(true) // 3000))
-        clouds.append(Cloud(scenario=SCENARIO, method=DENSE, found=aligned[some], true=true[some]))
+        clouds.append(Cloud(scenario=DENSE, method=METHOD, found=aligned[some], true=true[some]))
         began = perf_counter()
         vertices = align(found[best], true[best], _meshed(folder, view, say))
         surface = _compared(session, reference, vertices, view, align(found[best], true[best], found))
@@ -156,17 +155,17 @@ def _whole_way(session: Session, folder: Path, seed: int, num_images: int, say: 
         errors = np.abs(surface.errors[there])
         runs.append(
             Run(
-                scenario=SCENARIO, method=MESH, seed=seed, rmse=float(np.sqrt(np.mean(errors**2))),
+                scenario=MESH, method=METHOD, seed=seed, rmse=float(np.sqrt(np.mean(errors**2))),
                 median=float(np.median(errors)), outliers=float(np.mean(errors > TOLERANCE * BODY_DEPTH)),
                 kept=float(there.sum() / surface.seen.sum()), seconds=perf_counter() - began,
             )
         )  # fmt: skip
     except RefractError as error:
-        done = {run.method for run in runs}
+        done = {run.scenario for run in runs}
         runs += [
-            Run(scenario=SCENARIO, method=method, seed=seed, failure=str(error), seconds=perf_counter() - began)
-            for method in (SPARSE, DENSE, MESH)
-            if method not in done
+            Run(scenario=what, method=METHOD, seed=seed, failure=str(error), seconds=perf_counter() - began)
+            for what in (SPARSE, DENSE, MESH)
+            if what not in done
         ]
     return _Outcome(
         runs=runs, bound=bound, clouds=tuple(clouds), surface=surface, photographs=photographs,
@@ -210,7 +209,7 @@ def _refined(folder: Path, reference: str, say: Say) -> Path:
     done = reconstruct(
         folder / "workspace",
         ReconstructorOptions(matcher="flow", Flow=FlowOptions()),
-        RefinerOptions(scenario="fixed_camera", reference_image=reference),
+        RefinerOptions(scenario="fixed_camera", reference_image=reference, num_threads=1),
         image_path=folder / "chosen",
         camera_path=folder / CAMERAS_NAME,
         watcher=Telling(),
@@ -226,11 +225,11 @@ def _judged(session: Session, model_path: Path, seed: int, seconds: float) -> tu
 
     found = judge(read_model(model_path), session.truth)
     run = Run(
-        scenario=SCENARIO, method=SPARSE, seed=seed, rmse=found.rmse, median=found.median_error,
+        scenario=SPARSE, method=METHOD, seed=seed, rmse=found.rmse, median=found.median_error,
         outliers=float(np.mean(found.errors > TOLERANCE * BODY_DEPTH)),
         kept=found.num_points / (found.num_points + found.wrong_points), seconds=seconds,
     )  # fmt: skip
-    return run, Bound(scenario=SCENARIO, seed=seed, rmse=np.nan if found.bound is None else found.bound)
+    return run, Bound(scenario=SPARSE, seed=seed, rmse=np.nan if found.bound is None else found.bound)
 
 
 def _dense(folder: Path, model_path: Path, reference: str, say: Say) -> DenseView:
@@ -268,10 +267,10 @@ def _meshed(folder: Path, view: DenseView, say: Say) -> Array:
     return read_points(folder / "mesh.ply")
 
 
-def _run(method: str, seed: int, found: Array, true: Array, kept: float, seconds: float) -> Run:
+def _run(what: str, seed: int, found: Array, true: Array, kept: float, seconds: float) -> Run:
     errors = np.linalg.norm(found - true, axis=1)
     return Run(
-        scenario=SCENARIO, method=method, seed=seed, rmse=float(np.sqrt(np.mean(errors**2))),
+        scenario=what, method=METHOD, seed=seed, rmse=float(np.sqrt(np.mean(errors**2))),
         median=float(np.median(errors)), outliers=float(np.mean(errors > TOLERANCE * BODY_DEPTH)), kept=kept,
         seconds=seconds,
     )  # fmt: skip

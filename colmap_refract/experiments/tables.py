@@ -42,7 +42,7 @@ def rows(result: ExperimentResult) -> list[list[str]]:
             ratio = result.middle(case) / bound
             seconds = np.median([run.seconds for run in runs])
             out.append([
-                scenario, method, spread(result.values(case), 1e3), f"{1e3 * bound:.3g}",
+                scenario, method, spread(result.values(case), 1e3), f"{1e3 * bound:.3g}" if np.isfinite(bound) else "-",
                 f"{ratio:.2f}" if np.isfinite(ratio) else "-", spread(_every(result, case, "median"), 1e3),
                 percent("kept"), percent("outliers"), f"{seconds:.1f}", f"{failed} of {len(runs)}",
             ])  # fmt: skip
