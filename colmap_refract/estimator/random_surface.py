@@ -23,7 +23,7 @@ _SPREAD = 0.35
 _NUM_LENGTHS = 41
 _FARTHEST = 40.0
 """Dominant wavelengths at which nothing is left of the correlation."""
-_MOST_NODES = 900
+_MOST_NODES = 400
 _NODE_SPACING = 0.1
 """Dominant wavelengths between nodes."""
 _MARGIN = 0.1

@@ -16,34 +16,47 @@ from colmap_refract.refiner.arrangement import Arrangement, select_tracks
 from colmap_refract.refiner.continuation import Watch, named, residuals, retriangulate
 from colmap_refract.refiner.filtering import Filtered, filter_observations, in_cameras, predicted_directions
 from colmap_refract.refiner.start import image_depths, viewing_directions, world_plane
-from colmap_refract.refiner.wave_statistics import estimate_statistics, log_evidence
-from colmap_refract.refiner.waves import WaveStatistics, Wavy, frozen, spread_waves, surface_effects, with_waves
+from colmap_refract.refiner.wave_statistics import estimate_statistics, log_evidence, raw_residuals
+from colmap_refract.refiner.waves import WaveStatistics, Wavy, frozen, spread_waves, with_waves
 
 logger = logging.getLogger(__name__)
 
 _START_RATIO = 0.4
 """Distance over depth of the level plane that a moving interface starts from; the outcome does not depend on it."""
-_FEW_OBSERVATIONS = 150
+_FEW_OBSERVATIONS = 400
 """Per image, of the tracks that statistics and a first solution are found with."""
-_FIRST_MODES = (10, 16, 24)
 _STATISTICS_MODES = 24
-_FIRST_SLOPE, _FIRST_TILT, _FIRST_LIFT = np.tan(np.radians(2.0)), np.radians(2.0), 0.05
-_FIRST_WAVELENGTH = 2.0
-"""Over the width of what an image sees of its surface."""
-_FIRST_NOISE = 0.5
-_SCALES = (0.5, 2.0)
-_MOST_SCALINGS = 2
-_JOINT_ITERATIONS, _FROZEN_ITERATIONS = 15, 30
-_FINE, _FINER = 1e-6, 1e-8
-"""Function tolerances while the waves are looked up anew, and of the last solves."""
-_NUM_STATISTICS = 6
+_FIRST_TILT, _FIRST_LIFT = np.radians(4.0), 0.1
+_FIRST_WAVES = (
+    WaveStatistics(wavelength=2.0, slope_deviation=np.tan(np.radians(6.0)), noise=0.5, unresolved=0.1),
+    WaveStatistics(wavelength=0.1, slope_deviation=np.tan(np.radians(2.0)), noise=0.5),
+)
+"""A swell, and ripples; wavelengths over the width of what an image sees of its surface. Longer waves than that are
+tilts of its plane. A swell that is thought to be steeper than it is is found; one that is thought to be flat may not
+be. What is left of a smooth surface is noise rather than slopes."""
+_FIRST_SCALES = (0.5, 2.0)
+"""By which the wavelength of either is changed while the data become more probable."""
+_FIRST_SLOPE_AT_REST = np.tan(np.radians(2.0))
+"""For cameras whose poses are held: there the waves alone tell the depth of the water."""
+_SHORTEST_RESOLVED = 0.15
+"""Over the same width: some tens of modes say next to nothing of shorter waves, which all count as noise."""
+_STILL = np.tan(np.radians(0.01))
+"""Slope deviation of water that is as good as flat."""
+_MOST_SCALINGS = 3
+_EXPLAINED = 0.7
+"""Median residual, px, of a swell that needs no ripples."""
+_MOST_ITERATIONS = 30
+_FINER = 1e-8
+"""Function tolerance: the design changes between solves."""
+_MOST_FIRST, _NUM_UPDATES = 6, 3
+"""Solves with a guess of the statistics, until the points stay, and with what they then say of them."""
 _STAYS = 0.15
 """Relative change of the slope deviation that ends the search for it."""
-_MATTERS = 0.5
-"""Noise deviations: waves that move the keypoints by less are none."""
-_MOST_FROZEN = 6
-_SETTLED = 0.05
-"""Noise deviations by which predicted keypoints still move between the rounds that end the last solves."""
+_MOST_LAST = 2
+"""Each round looks the waves up in the last one's solution, noise included: with steep waves further rounds move
+points by many times their deviation along what is hardly determined, at the same cost."""
+_SETTLED, _ALMOST_SETTLED = 0.05, 0.3
+"""Noise deviations by which predicted keypoints still move between rounds, the last and the first."""
 _LOSS_SCALE_IN_NOISE = 4.0
 _WIDE = 4.0
 """Times the median residual: the scale of the loss of the first solves."""
@@ -74,6 +87,24 @@ class WaveOptions:
     tilt: float | None
     lift: float | None
     num_modes: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Round:
+    """One solve.
+
+    Attributes:
+        wavy: at the solution.
+        solved: what was solved, at its solution: the waves' effects as they stood.
+        adjustment: the solver's word.
+        statistics, level: the priors that it was solved with.
+    """
+
+    wavy: Wavy
+    solved: Problem
+    adjustment: Adjustment
+    statistics: WaveStatistics
+    level: LevelPrior | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,8 +178,7 @@ class _Solver:
         self.options = options
         self.settings = settings
         self.watch = watch
-        # A fixed camera tells the depth of the water by how much the waves do: the one must not explain the other.
-        self.always_frozen = bool(held.poses.all())
+        self.width = _width(self.flat)
 
     def solve(
         self,
@@ -158,34 +188,38 @@ class _Solver:
         num_modes: int,
         *,
         stage: str,
-        joint: bool,
         wide: bool = False,
-        iterations: int | None = None,
-    ) -> tuple[Wavy, Adjustment, Problem]:
+    ) -> Round:
         """One round: the design at the current solution, and a solve."""
         if self.options.wavelength_in_depths is not None:
             length = self.options.wavelength_in_depths / _distance_in_depths(self.flat if current is None else current)
             statistics = replace(statistics, wavelength=length)
+        if statistics.wavelength < _SHORTEST_RESOLVED * self.width:
+            num_modes = 0
         wavy = with_waves(self.flat, statistics, num_modes, current)
         scale = _LOSS_SCALE_IN_NOISE * statistics.noise
         if wide:
             # Before waves are known, all residuals are large; wrong matches are larger.
             scale = max(scale, _WIDE * float(np.median(np.abs(residuals(wavy.problem)))))
         problem = replace(wavy.problem, level_prior=level, loss="cauchy", loss_scale=scale)
-        count = iterations or (_JOINT_ITERATIONS if joint else _FROZEN_ITERATIONS)
         quick = replace(
             self.settings,
-            max_num_iterations=min(self.settings.max_num_iterations, count),
-            function_tolerance=max(self.settings.function_tolerance, _FINE if joint else _FINER),
+            max_num_iterations=min(self.settings.max_num_iterations, _MOST_ITERATIONS),
+            function_tolerance=max(self.settings.function_tolerance, _FINER),
         )
-        joint = joint and not self.always_frozen
-        posed = problem if joint else frozen(problem)
+        posed = frozen(problem)
         adjustment = adjust(posed, quick, on_progress=named(self.watch, stage))
         finite = np.isfinite(adjustment.state.distance).all() and np.isfinite(adjustment.points).all()
         if adjustment.termination == "failure" or not finite:
             raise Unsupported("Waves are not determined: the solver failed with them")
         found = {"state": adjustment.state, "points": adjustment.points}
-        return replace(wavy, problem=replace(problem, **found)), adjustment, replace(posed, **found)  # type: ignore[arg-type]
+        return Round(
+            wavy=replace(wavy, problem=replace(problem, **found)),  # type: ignore[arg-type]
+            solved=replace(posed, **found),  # type: ignore[arg-type]
+            adjustment=adjustment,
+            statistics=statistics,
+            level=level,
+        )
 
 
 def solve_soft(
@@ -212,58 +246,111 @@ def solve_soft(
     few = keep & select_tracks(arrangement.observations, _FEW_OBSERVATIONS, arrangement.options.random_seed)
     check_support(arrangement, keep)
     solver = _Solver(_part(start, few), options, settings, watch)
-    statistics, level = _first_guess(solver.flat, options)
-    statistics_modes = min(_STATISTICS_MODES, options.num_modes)
-    current: Problem | None = None
-    for num_modes in _FIRST_MODES:
-        wavy, *_ = solver.solve(
-            current, statistics, level, min(num_modes, options.num_modes), stage="Waves", joint=True, wide=True
-        )
-        current = wavy.problem
-    assert current is not None
-    # Only now: statistics of a solution that is still far from its minimum would lead it astray.
-    statistics, level = _updated(wavy, statistics, options)
+    found = _find_waves(solver, options)
+    if not _shows_waves(solver, found):
+        raise Unsupported("The surface shows no waves")
+    if few[keep].all():
+        return _last_rounds(solver, found.wavy.problem, found.statistics, found.level)
+    whole = _Solver(_part(start, keep), options, settings, watch)
+    return _last_rounds(whole, spread_waves(found.wavy, whole.flat), found.statistics, found.level)
+
+
+def _find_waves(solver: _Solver, options: WaveOptions) -> Round:
+    """The statistics that make the data most probable, at a solution with them: swell or ripples first, then finer."""
+    tried: list[tuple[float, float, Round]] = []
+    failed: Unsupported | None = None
+    for factor, (statistics, level) in zip(_FIRST_SCALES, _first_guesses(solver.flat, options), strict=False):
+        try:
+            found = _with_statistics(solver, _settled(solver, statistics, level))
+        except Unsupported as unsupported:
+            failed = unsupported
+            continue
+        tried.append((_evidence(solver, found), factor, found))
+        if float(np.median(np.abs(raw_residuals(found.wavy, found.solved)))) < _EXPLAINED:
+            break
+    if not tried:
+        assert failed is not None
+        raise failed
+    best, factor, found = max(tried, key=lambda one: one[0])
     if options.wavelength is None and options.wavelength_in_depths is None:
-        statistics, current = _choose_wavelength(solver, current, statistics, level, options)
-    for _ in range(_NUM_STATISTICS):
-        wavy, *_ = solver.solve(current, statistics, level, statistics_modes, stage="Wave statistics", joint=True)
-        current = wavy.problem
-        before = statistics
-        statistics, level = _updated(wavy, statistics, options)
+        for _ in range(_MOST_SCALINGS):
+            statistics = replace(found.statistics, wavelength=factor * found.statistics.wavelength)
+            try:
+                other = _solve_once(solver, found.wavy.problem, statistics, found.level)
+            except Unsupported:
+                break
+            if (evidence := _evidence(solver, other)) <= best:
+                break
+            best, found = evidence, other
+        logger.info("wavelength %.3g of the interface distance", found.statistics.wavelength)
+    return found
+
+
+def _solve_once(
+    solver: _Solver,
+    current: Problem | None,
+    statistics: WaveStatistics,
+    level: LevelPrior | None,
+    *,
+    wide: bool = False,
+) -> Round:
+    num_modes = min(_STATISTICS_MODES, solver.options.num_modes)
+    return solver.solve(current, statistics, level, num_modes, stage="Wave statistics", wide=wide)
+
+
+def _settled(solver: _Solver, statistics: WaveStatistics, level: LevelPrior | None) -> Round:
+    """Solve until the points stay: statistics of a solution that is far from its minimum would lead it astray."""
+    found = _solve_once(solver, None, statistics, level, wide=True)
+    for number in range(1, _MOST_FIRST):
+        before = found.wavy.problem
+        found = _solve_once(solver, before, statistics, level, wide=number == 1)
+        if _change(before, found.wavy.problem) < _ALMOST_SETTLED:
+            break
+    return found
+
+
+def _with_statistics(solver: _Solver, found: Round) -> Round:
+    """Say anew how steep the waves are, and solve again, until that stays."""
+    for _ in range(_NUM_UPDATES):
+        before = found.statistics
+        statistics, level = _updated(found, solver.options)
+        found = _solve_once(solver, found.wavy.problem, statistics, level)
         if abs(np.log(statistics.slope_deviation / before.slope_deviation)) < _STAYS:
             break
-    if _effect(wavy.problem) < _MATTERS * statistics.noise:
-        raise Unsupported("The surface shows no waves")
-    wavy, *_ = solver.solve(current, statistics, level, options.num_modes, stage="Waves", joint=False)
-    if few[keep].all():
-        return _frozen_rounds(solver, wavy.problem, statistics, level)
-    whole = _Solver(_part(start, keep), options, settings, watch)
-    wavy, *_ = whole.solve(
-        spread_waves(wavy, whole.flat), statistics, level, options.num_modes, stage="Waves", joint=True
-    )
-    return _frozen_rounds(whole, wavy.problem, statistics, level)
+    return found
 
 
-def _effect(problem: Problem) -> float:
-    """How far the waves move a keypoint, px: root mean square of what the surfaces do at the solution."""
-    effects = np.einsum("nak,nk->na", surface_effects(problem) @ problem.tracks.waves,
-                        problem.state.waves[problem.tracks.image])  # fmt: skip
-    return float(np.sqrt((effects**2).mean()))
+def _shows_waves(solver: _Solver, found: Round) -> bool:
+    """Whether waves make the data more probable than still water does."""
+    still = replace(found.statistics, slope_deviation=float(_STILL), unresolved=1.0)
+    flat = _solve_once(solver, found.wavy.problem, still, found.level)
+    for _ in range(_NUM_UPDATES):
+        statistics, level = estimate_statistics(flat.wavy, flat.solved, flat.statistics, given_slope=True)
+        flat = _solve_once(solver, flat.wavy.problem, statistics, level)
+    return _evidence(solver, found) > _evidence(solver, flat)
 
 
-def _frozen_rounds(
-    solver: _Solver, current: Problem, statistics: WaveStatistics, level: LevelPrior | None
+def _evidence(solver: _Solver, found: Round) -> float:
+    """Log probability of the data with a round's statistics."""
+    whitening = float(np.log(np.linalg.det(found.wavy.whiten)).sum())
+    return log_evidence(found.solved, found.statistics.noise, whitening)
+
+
+def _last_rounds(
+    solver: _Solver, current: Problem, statistics: WaveStatistics, level: LevelPrior | None, most: int = _MOST_LAST
 ) -> SoftSolution:
-    """The last solves: the waves' effects as they stand, and looked up anew until they stay."""
-    for number in range(_MOST_FROZEN):
-        wavy, adjustment, solved = solver.solve(
-            current, statistics, level, solver.options.num_modes, stage=f"Waves, round {number + 1}", joint=False
+    """All observations and modes, until the points stay."""
+    for number in range(most):
+        found = solver.solve(
+            current, statistics, level, solver.options.num_modes, stage=f"Waves, round {number + 1}", wide=number == 0
         )
-        settled = number > 0 and _change(current, wavy.problem) < _SETTLED
-        current = wavy.problem
+        settled = number > 0 and _change(current, found.wavy.problem) < _SETTLED
+        current = found.wavy.problem
         if settled:
             break
-    return SoftSolution(wavy=wavy, statistics=statistics, level=level, adjustment=adjustment, solved=solved)
+    return SoftSolution(
+        wavy=found.wavy, statistics=found.statistics, level=level, adjustment=found.adjustment, solved=found.solved
+    )
 
 
 def go_on(
@@ -288,7 +375,7 @@ def go_on(
         lift=None, num_modes=soft.wavy.problem.num_waves,
     )  # fmt: skip
     solver = _Solver(_part(start, keep), options, settings, watch)
-    return _frozen_rounds(solver, _part(everywhere, keep), soft.statistics, soft.level)
+    return _last_rounds(solver, _part(everywhere, keep), soft.statistics, soft.level, most=1)
 
 
 def settle_everywhere(start: Problem, soft: SoftSolution) -> Problem:
@@ -339,15 +426,24 @@ def _part(start: Problem, keep: NDArray[np.bool_]) -> Problem:
     return replace(start, tracks=start.tracks.take(first, keep), points=start.points[stays])
 
 
-def _first_guess(flat: Problem, options: WaveOptions) -> tuple[WaveStatistics, LevelPrior | None]:
-    slope = options.slope_deviation or float(_FIRST_SLOPE)
-    wavelength = options.wavelength or _FIRST_WAVELENGTH * _width(flat)
-    statistics = WaveStatistics(slope_deviation=slope, wavelength=wavelength, noise=_FIRST_NOISE)
-    if not options.level_prior:
-        return statistics, None
-    tilt = options.tilt if options.tilt is not None else float(_FIRST_TILT)
-    lift = options.lift if options.lift is not None else _FIRST_LIFT
-    return statistics, LevelPrior(tilt=tilt, lift=lift, noise=_FIRST_NOISE)
+def _first_guesses(flat: Problem, options: WaveOptions) -> list[tuple[WaveStatistics, LevelPrior | None]]:
+    """What to start from: each may end in another minimum."""
+    level = None
+    if options.level_prior:
+        tilt = options.tilt if options.tilt is not None else float(_FIRST_TILT)
+        lift = options.lift if options.lift is not None else _FIRST_LIFT
+        level = LevelPrior(tilt=tilt, lift=lift, noise=_FIRST_WAVES[0].noise)
+    width = _width(flat)
+    waves = [replace(statistics, wavelength=statistics.wavelength * width) for statistics in _FIRST_WAVES]
+    if options.wavelength is not None:
+        waves = [replace(waves[0], wavelength=options.wavelength)]
+    elif options.wavelength_in_depths is not None:
+        waves = waves[:1]
+    if flat.held.poses.all():
+        waves = [replace(statistics, slope_deviation=float(_FIRST_SLOPE_AT_REST)) for statistics in waves]
+    if options.slope_deviation is not None:
+        waves = [replace(statistics, slope_deviation=options.slope_deviation) for statistics in waves]
+    return [(statistics, level) for statistics in waves]
 
 
 def _distance_in_depths(problem: Problem) -> float:
@@ -370,10 +466,10 @@ def _width(flat: Problem) -> float:
     return float(np.median(widths))
 
 
-def _updated(wavy: Wavy, statistics: WaveStatistics, options: WaveOptions) -> tuple[WaveStatistics, LevelPrior | None]:
+def _updated(found: Round, options: WaveOptions) -> tuple[WaveStatistics, LevelPrior | None]:
     given = options.slope_deviation is not None
-    before = wavy.problem.level_prior
-    statistics, level = estimate_statistics(wavy.problem, statistics, given_slope=given)
+    statistics, level = estimate_statistics(found.wavy, found.solved, found.statistics, given_slope=given)
+    before = found.level
     if level is not None and before is not None:
         level = replace(
             level,
@@ -381,33 +477,6 @@ def _updated(wavy: Wavy, statistics: WaveStatistics, options: WaveOptions) -> tu
             lift=before.lift if options.lift is not None else level.lift,
         )
     return statistics, level
-
-
-def _choose_wavelength(
-    solver: _Solver, current: Problem, statistics: WaveStatistics, level: LevelPrior | None, options: WaveOptions
-) -> tuple[WaveStatistics, Problem]:
-    """The wavelength, up to a factor of two, that makes the data most probable."""
-    tried: dict[float, tuple[float, Problem]] = {}
-    num_modes = min(_STATISTICS_MODES, options.num_modes)
-
-    def judge(wavelength: float) -> float:
-        if wavelength not in tried:
-            changed = replace(statistics, wavelength=wavelength)
-            wavy, *_ = solver.solve(current, changed, level, num_modes, stage="Wavelength", joint=True, iterations=6)
-            whitening = np.linalg.norm(wavy.problem.tracks.metric, axis=(1, 2))
-            before = np.linalg.norm(solver.flat.tracks.metric, axis=(1, 2))
-            log_whitening = 2.0 * float(np.log(whitening / before).sum())
-            tried[wavelength] = log_evidence(wavy.problem, statistics.noise, log_whitening), wavy.problem
-        return tried[wavelength][0]
-
-    best = statistics.wavelength
-    for _ in range(_MOST_SCALINGS):
-        found = max([best, *(factor * best for factor in _SCALES)], key=judge)
-        if found == best:
-            break
-        best = found
-    logger.info("wavelength %.3g of the interface distance", best)
-    return replace(statistics, wavelength=best), tried[best][1]
 
 
 def _change(before: Problem, after: Problem) -> float:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from colmap_refract.estimator.chunk import LevelPrior, Problem
@@ -16,17 +17,26 @@ from colmap_refract.estimator.elimination import LEVEL, PLANE, POSE, WAVES
 from colmap_refract.estimator.priors import compare_to_level, first_images, images_with_waves, mean_plane, plane_stands
 from colmap_refract.interface import Array, tangent_basis
 from colmap_refract.refiner.continuation import residuals
-from colmap_refract.refiner.filtering import noise as noise_of
 from colmap_refract.refiner.normal_equations import NormalEquations, normal_equations
-from colmap_refract.refiner.waves import WaveStatistics
+from colmap_refract.refiner.waves import WaveStatistics, Wavy
 
 _JITTER = 1e-9
 """Of the scaled diagonal: what the gauge leaves without curvature."""
 _LEAST_SLOPE, _MOST_SLOPE = np.tan(np.radians(0.02)), np.tan(np.radians(20.0))
 _LEAST_TILT, _LEAST_LIFT = np.radians(0.01), 1e-4
-_LEAST_NOISE = 1e-6
 _LARGEST_FACTOR = 3.0
 """By which one update may change a deviation."""
+_LEAST_NOISE, _MOST_NOISE = 1e-6, 1.0
+"""Pixels: keypoints are found to better, so that more is something else."""
+_USUAL_NOISE, _USUAL_WEIGHT = 0.3, 2.0
+"""Of keypoints, px, and in how many coordinates' worth of evidence."""
+_LEAST_DETERMINED = 1.0
+_LEAST_FREE = 0.05
+_MOST_UPDATES, _SETTLED = 200, 1e-4
+_LARGEST_SQUARE, _MEDIAN_SQUARE = 9.21, 1.386
+"""Of a chi-squared variable of two degrees of freedom: one in a hundred is larger, one in two is."""
+_KEPT_SQUARE = 0.9535
+"""Of its mean, of those that are not larger."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,39 +69,88 @@ def posterior(problem: Problem) -> Posterior | None:
 
 
 def estimate_statistics(
-    problem: Problem, statistics: WaveStatistics, *, given_slope: bool
+    wavy: Wavy, solved: Problem, statistics: WaveStatistics, *, given_slope: bool
 ) -> tuple[WaveStatistics, LevelPrior | None]:
     """One update of slope deviation, noise and level prior at a solution with waves.
 
+    Slopes show in the coefficients, and, where the modes cannot take them, in residuals that grow with the depth of
+    the water; the noise of the keypoints does not. Wrong matches are left out.
+
     Args:
-        problem: at its solution.
+        wavy: at its solution.
+        solved: what was solved, at its solution.
         statistics: that it was solved with.
         given_slope: whether the slope deviation stays as it is.
     """
-    level = problem.level_prior
-    found = posterior(problem)
+    level = solved.level_prior
+    found = posterior(solved)
     if found is None:
         return statistics, level
     system, variance = found.system, np.diag(found.covariance)
     unit = statistics.noise**2
     determined, squared = 0.0, 0.0
-    for image in images_with_waves(problem).tolist():
+    for image in images_with_waves(solved).tolist():
         if (WAVES, image) not in system.columns:
             continue
         first = system.columns[WAVES, image]
-        mine = np.arange(first, first + problem.num_waves)
+        mine = np.arange(first, first + solved.num_waves)
         determined += float((1.0 - np.minimum(unit * variance[mine], 1.0)).sum())
-        squared += float((problem.state.waves[image] ** 2).sum())
-    slope = statistics.slope_deviation
-    if not given_slope and determined > 1.0:
-        factor = np.clip(np.sqrt(squared / determined), 1.0 / _LARGEST_FACTOR, _LARGEST_FACTOR)
-        slope = float(np.clip(slope * factor, _LEAST_SLOPE, _MOST_SLOPE))
-    unknowns = 3 * len(problem.points) + determined
+        squared += float((solved.state.waves[image] ** 2).sum())
+    unknowns = 3 * len(solved.points) + determined
     unknowns += sum(width for key, width in system.widths.items() if key[0] in (POSE, PLANE))
-    noise = max(noise_of(residuals(problem), unknowns), _LEAST_NOISE)
+    grown, noise = _settle_residuals(wavy, solved, statistics, unknowns)
+    slope, unresolved = statistics.slope_deviation, statistics.unresolved
+    if not given_slope:
+        # Modes tell the slopes where there are any; else what is unresolved is all of them.
+        factor = np.sqrt(squared / determined) if determined > _LEAST_DETERMINED else np.sqrt(grown)
+        slope *= float(np.clip(factor, 1.0 / _LARGEST_FACTOR, _LARGEST_FACTOR))
+        slope = float(np.clip(slope, _LEAST_SLOPE, _MOST_SLOPE))
+        unresolved *= grown * (statistics.slope_deviation / slope) ** 2
     if level is not None:
-        level = _scatter(problem, replace(level, noise=noise), found, statistics.noise)
-    return replace(statistics, slope_deviation=slope, noise=noise), level
+        level = _scatter(solved, replace(level, noise=noise), found, statistics.noise)
+    return replace(statistics, slope_deviation=slope, noise=noise, unresolved=unresolved), level
+
+
+def _settle_residuals(wavy: Wavy, solved: Problem, statistics: WaveStatistics, unknowns: float) -> tuple[float, float]:
+    """By what the variance of unresolved slopes is larger than was thought, and the noise, as the residuals show.
+
+    A residual is the sum of noise and of unresolved slopes, whose covariance is known but for its size: with `C` that
+    of the sum and `V` that of a part, the part's square is expected to be `tr(C^-1 V)` and found to be
+    `r^T C^-1 V C^-1 r`. What is found over what is expected corrects the part's variance.
+    """
+    raw = raw_residuals(wavy, solved)
+    inverse = np.linalg.inv(wavy.whiten)
+    unresolved = (inverse @ inverse.transpose(0, 2, 1) - np.eye(2)) * statistics.noise**2
+    # Residuals are smaller than what they estimate by the degrees of freedom that were fitted.
+    free = max(1.0 - unknowns / (2 * len(raw)), _LEAST_FREE) * _KEPT_SQUARE
+    grown, noise = 1.0, statistics.noise
+    for _ in range(_MOST_UPDATES):
+        before = grown, noise
+        inverse = np.linalg.inv(noise**2 * np.eye(2) + grown * unresolved)
+        weighted = np.einsum("nab,nb->na", inverse, raw)
+        good = _without_outliers(np.einsum("na,na->n", weighted, raw))
+        by_slopes = grown * np.einsum("na,nab,nb->n", weighted, unresolved, weighted)[good].sum()
+        expected = free * np.einsum("nab,nba->n", inverse, unresolved)[good].sum()
+        grown = float((grown * by_slopes + _USUAL_WEIGHT) / (grown * expected + _USUAL_WEIGHT))
+        grown = float(np.clip(grown, _LARGEST_FACTOR**-2, _LARGEST_FACTOR**2))
+        # Under waves much larger than the noise nothing is seen of it.
+        noisy = noise**4 * (weighted[good] ** 2).sum()
+        expected = free * noise**2 * np.einsum("naa->n", inverse[good]).sum()
+        noise = float(np.sqrt((noisy + _USUAL_WEIGHT * _USUAL_NOISE**2) / (expected + _USUAL_WEIGHT)))
+        noise = float(np.clip(noise, _LEAST_NOISE, _MOST_NOISE))
+        if np.allclose(np.log([grown, noise]), np.log(before), atol=_SETTLED):
+            break
+    return grown, noise
+
+
+def raw_residuals(wavy: Wavy, solved: Problem) -> Array:
+    """(N, 2) px: residuals before what unresolved slopes add to their variance was taken out."""
+    return np.asarray(np.linalg.solve(wavy.whiten, residuals(solved)[:, :, None])[:, :, 0])
+
+
+def _without_outliers(squares: Array) -> NDArray[np.bool_]:
+    """Which squared residuals a normal distribution of the same median has, but for one in a hundred."""
+    return np.asarray(squares <= _LARGEST_SQUARE * np.median(squares) / _MEDIAN_SQUARE)
 
 
 def _scatter(problem: Problem, level: LevelPrior, found: Posterior, noise: float) -> LevelPrior:
@@ -151,4 +210,4 @@ def log_evidence(problem: Problem, noise: float, log_whitening: float) -> float:
     if mine:
         at = np.concatenate(mine)
         volume = 0.5 * float(np.linalg.slogdet(hessian[at][:, at].toarray() / noise**2)[1])
-    return -system.cost / noise**2 - volume + log_whitening
+    return -system.cost / noise**2 - volume + log_whitening - 2.0 * len(problem.tracks.image) * float(np.log(noise))

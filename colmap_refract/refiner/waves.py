@@ -44,11 +44,17 @@ class WaveStatistics:
         slope_deviation: root mean square slope over both axes, a tangent.
         wavelength: the dominant one, over the median distance of the interfaces.
         noise: of a keypoint coordinate, px.
+        unresolved: variance of the slopes that the modes cannot take, over what the spectrum has there.
     """
 
     slope_deviation: float
     wavelength: float
     noise: float
+    unresolved: float = 1.0
+
+    def total_slope(self, explained: float) -> float:
+        """Slope deviation of all waves, where the modes can take a part of the variance that the spectrum has."""
+        return self.slope_deviation * float(np.sqrt(explained + (1.0 - explained) * self.unresolved))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,11 +65,13 @@ class Wavy:
         problem: every observation with a local plane of its own.
         modes: (I,) the shapes on each image's plane, lengths over its distance; None for images without interface.
         explained: the part of the slopes' variance that the modes can take; the rest counts as noise.
+        whiten: (N, 2, 2) what residuals were multiplied with for it.
     """
 
     problem: Problem
     modes: list[Modes | None]
     explained: float
+    whiten: Array
 
 
 def with_waves(flat: Problem, statistics: WaveStatistics, num_modes: int, current: Problem | None = None) -> Wavy:
@@ -72,7 +80,7 @@ def with_waves(flat: Problem, statistics: WaveStatistics, num_modes: int, curren
     Args:
         flat: without waves; its observations, tying and metric.
         statistics: of the waves; the prior.
-        num_modes: coefficients per image, at most.
+        num_modes: coefficients per image, at most; with 0 all slopes count as noise, and one coefficient does nothing.
         current: the latest solution of the same observations, with waves or not, to go on from; else `flat`'s state.
     """
     structure, tracks = flat.structure, flat.tracks
@@ -90,13 +98,14 @@ def with_waves(flat: Problem, statistics: WaveStatistics, num_modes: int, curren
     with np.errstate(invalid="ignore"):
         foot = sight / np.einsum("ni,ni->n", sight, normal[tracks.image])[:, None]
     places = np.einsum("nia,ni->na", axes[tracks.image], foot) * (1.0 + relief[:, :1])
+    resolved, num_modes = num_modes > 0, max(num_modes, 1)
     by_image: list[Modes | None] = [None] * structure.num_images
     waves = np.zeros((len(tracks.image), 3, num_modes))
     coefficients = np.zeros((structure.num_images, num_modes))
     tolerance = _FIT * statistics.slope_deviation
     for image in np.flatnonzero(refracted).tolist():
         mine = np.flatnonzero((tracks.image == image) & np.isfinite(places).all(axis=1))
-        if not len(mine):
+        if not len(mine) or not resolved:
             continue
         length = statistics.wavelength * typical / distance[image]
         surface = RandomSurface(slope_deviation=statistics.slope_deviation, wavelength=length)
@@ -120,9 +129,11 @@ def with_waves(flat: Problem, statistics: WaveStatistics, num_modes: int, curren
     per_axis = 0.5 * statistics.slope_deviation**2
     left = per_axis * np.eye(2) - np.einsum("nak,nbk->nab", waves[:, 1:], waves[:, 1:])
     share = np.einsum("naa->n", left)[refracted[tracks.image]] / (2.0 * per_axis)
-    whiten = _whitening(surface_effects(wavy)[:, :, 1:], left, statistics.noise)
+    whiten = _whitening(surface_effects(wavy)[:, :, 1:], statistics.unresolved * left, statistics.noise)
     whitened = wavy.tracks._replace(metric=whiten @ tracks.metric, lens=whiten @ tracks.lens)
-    return Wavy(problem=replace(wavy, tracks=whitened), modes=by_image, explained=float(1.0 - share.mean()))
+    return Wavy(
+        problem=replace(wavy, tracks=whitened), modes=by_image, explained=float(1.0 - share.mean()), whiten=whiten
+    )
 
 
 def spread_waves(wavy: Wavy, flat: Problem) -> Problem:
