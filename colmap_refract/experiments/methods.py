@@ -22,6 +22,10 @@ _PRINTED_IMAGES, _PRINTED_ITERATIONS = 10, 60
 """What the soft constraint as printed gets: its time grows quickly with the images."""
 
 
+_EVERY = 5
+"""Of a thousand frames, where each has a plane of its own."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
     """What a method makes of a capture: points (3,) by id, in any frame and size, and what it says of them."""
@@ -98,12 +102,22 @@ def _with_reference(setup: Setup) -> Estimate:
     return _refined(setup, RefinerOptions(scenario=setup.scenario, reference_rays=True))
 
 
-def _printed(setup: Setup) -> Estimate:
+def _start_of(setup: Setup, frames: list[int]) -> pycolmap.Reconstruction:
+    """The start with some of its frames."""
     model = ignore_refraction(setup.capture)
-    frames = sorted(model.frames)
-    few = frames[:: max(1, -(-len(frames) // _PRINTED_IMAGES))]
-    for frame_id in set(frames) - set(few):
+    for frame_id in set(model.frames) - set(frames):
         model.deregister_frame(frame_id)
+    return model
+
+
+def _some(setup: Setup) -> Estimate:
+    frames = sorted(setup.capture.reconstruction.frames)[::_EVERY]
+    return _refined(setup, RefinerOptions(scenario=setup.scenario), start=_start_of(setup, frames))
+
+
+def _printed(setup: Setup) -> Estimate:
+    frames = sorted(setup.capture.reconstruction.frames)
+    few = frames[:: max(1, -(-len(frames) // _PRINTED_IMAGES))]
     options = RefinerOptions(
         scenario=setup.scenario,
         interface_shape="soft_as_printed",
@@ -113,7 +127,7 @@ def _printed(setup: Setup) -> Estimate:
         pixel_noise=setup.capture.options.pixel_noise,
         BundleAdjustment=BundleAdjustmentOptions(max_num_iterations=_PRINTED_ITERATIONS, function_tolerance=1e-6),
     )
-    estimate = _refined(setup, options, start=model)
+    estimate = _refined(setup, options, start=_start_of(setup, few))
     remarks = [f"{len(few)} images", *([estimate.remark] if estimate.remark else [])]
     return replace(estimate, remark=", ".join(remarks))
 
@@ -251,6 +265,12 @@ SOFT = Method(
     given="as hard",
     estimate=_soft,
     suits=wavy,
+)
+SOME = Method(
+    name=f"hard, every {_EVERY}th frame",
+    text=f"hard on one frame in {_EVERY}, a plane per frame: of all, a plane each takes many minutes",
+    given="as hard",
+    estimate=_some,
 )
 TIED = Method(
     name="hard, shared planes",
