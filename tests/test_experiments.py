@@ -290,7 +290,7 @@ def test_what_differs_from_the_paper_is_said() -> None:
     assert judged(finding, a_result([1e-3], [2e-3])) == "The paper: a is better than b. Here, too: 1 against 2 mm."
     assert "otherwise: 2 against 1 mm" in judged(finding, a_result([2e-3], [1e-3]))
     assert "hardly differ: 1 against 1.02 mm" in judged(finding, a_result([1e-3], [1.02e-3]))
-    assert "cannot be told" in judged(finding, a_result([np.nan], [1e-3]))
+    assert "cannot be compared: a has no result, b has 1 mm" in judged(finding, a_result([np.nan], [1e-3]))
 
 
 def test_failures_are_counted_and_told() -> None:

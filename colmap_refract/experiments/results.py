@@ -167,9 +167,14 @@ def merged(parts: Sequence[ExperimentResult]) -> ExperimentResult:
 def judged(finding: Finding, result: ExperimentResult) -> str:
     """Whether what was measured agrees with the paper, in a sentence."""
     better, worse = (result.middle(case, finding.measure) for case in (finding.better, finding.worse))
-    if not (np.isfinite(better) and np.isfinite(worse)):
-        return f"The paper: {finding.text}. Here it cannot be told: one of the two did not run or failed."
     unit, scale = ("mm", 1e3) if finding.measure == "rmse" else ("% of the points", 1e2)
+    if not (np.isfinite(better) and np.isfinite(worse)):
+        cases = ((finding.better, better), (finding.worse, worse))
+        here = [
+            f"{case.method} has {scale * value:.3g} {unit}" if np.isfinite(value) else f"{case.method} has no result"
+            for case, value in cases
+        ]
+        return f"The paper: {finding.text}. Here they cannot be compared: {', '.join(here)}."
     figures = f"{scale * better:.3g} against {scale * worse:.3g} {unit}"
     if abs(better - worse) < _SAME * max(better, worse):
         return f"The paper: {finding.text}. Here they hardly differ: {figures}."
