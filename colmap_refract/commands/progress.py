@@ -27,7 +27,10 @@ class ProgressLine:
             sys.stderr.flush()
 
     def show(self, stage: str, progress: Progress) -> None:
-        """Called by the solver after every iteration."""
+        """Called by the solver after every iteration, and by other stages after every part."""
+        if progress.total is not None:
+            self._write(f"{stage}: {progress.iteration} of {progress.total}")
+            return
         self._write(
             f"{stage}: iteration {progress.iteration}, error {progress.rms:.4g} px (rms), "
             f"gradient {progress.gradient_max_norm:.2g}"

@@ -82,6 +82,12 @@ class Refiner:
                 result.sidecar.statistics["comparison"] = comparison.as_dict()
             write_model(result.reconstruction, folder)
             write_sidecar(result.sidecar, folder / SIDECAR_NAME)
-            write_surfaces(folder, result.reconstruction, result.sidecar)
+            with ProgressLine() as line:
+                write_surfaces(
+                    folder,
+                    result.reconstruction,
+                    result.sidecar,
+                    lambda done, all_: line.say(f"Surfaces: {done} of {all_}"),
+                )
         print(report(result.sidecar))
         print(f"\nWritten to {self.output_path}")

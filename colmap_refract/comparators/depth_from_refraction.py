@@ -29,7 +29,7 @@ from colmap_refract.estimator import random_slopes
 from colmap_refract.estimator.elimination import Optics
 from colmap_refract.estimator.optics import Media, back_project, is_wet, project_direction
 from colmap_refract.estimator.random_slopes import Deviations, KnownViews, Sights
-from colmap_refract.estimator.robust import LOSSES
+from colmap_refract.estimator.robust import TRIVIAL
 from colmap_refract.interface import Array, Layers, tangent_basis
 from colmap_refract.options import ImageNotes, RefinerOptions
 from colmap_refract.refiner.refinement import refine
@@ -204,7 +204,7 @@ def _most_likely(points: Array, direction: Array, metric: Array, normal: Array, 
     media = Media(layers)
     optics = Optics(media.ratio, media.ratio_by_index, media.walls)
     settled = points.copy()
-    random_slopes.settle(settled, 0, count, sights, views, optics, Deviations(1.0, 0.0), LOSSES["trivial"], 1.0)
+    random_slopes.settle(settled, 0, count, sights, views, optics, Deviations(1.0, 0.0), TRIVIAL, 1.0)
     return settled
 
 

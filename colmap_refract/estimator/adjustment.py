@@ -4,6 +4,8 @@ A chunk's reduced cost `f`, gradient `g` and Gauss-Newton matrix `H = U^T U` (Ch
 residual block with residual `[U^-T g; sqrt(2 f - |U^-T g|^2)]` and Jacobian `[U; 0]`: the same cost, the same
 gradient, the same Gauss-Newton matrix. A trial step needs the cost only, `[0; sqrt(2 f)]`. Ceres keeps the
 trust region, the bounds, the manifolds, further residual blocks (priors) and the report.
+
+With waves the blocks are too wide for that, and modules `whole` and `levenberg` do Ceres' part.
 """
 
 from __future__ import annotations
@@ -21,8 +23,10 @@ from threadpoolctl import threadpool_limits
 
 from colmap_refract.estimator.chunk import Chunk, Problem, change_of, slot_width, split
 from colmap_refract.estimator.elimination import PLANE, POSE, Anchors
+from colmap_refract.estimator.levenberg import Tolerances, descend
 from colmap_refract.estimator.priors import PriorBlock, prior_blocks
 from colmap_refract.estimator.scenario import State, apply
+from colmap_refract.estimator.whole import Whole
 from colmap_refract.interface import Array
 
 logger = logging.getLogger(__name__)
@@ -50,7 +54,10 @@ class SolverSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
-    """One iteration of the solver, for whoever watches."""
+    """One iteration of the solver, for whoever watches; or how far another stage is, see `part_done`.
+
+    `total` is None for the solver; else `iteration` of so many parts are done, and nothing else is known.
+    """
 
     iteration: int
     cost: float
@@ -58,6 +65,15 @@ class Progress:
     gradient_max_norm: float
     step_norm: float
     successful: bool
+    total: int | None = None
+
+
+def part_done(done: int, total: int) -> Progress:
+    """How far a stage is that solves nothing."""
+    nan = float("nan")
+    return Progress(
+        iteration=done, cost=nan, rms=nan, gradient_max_norm=nan, step_norm=nan, successful=True, total=total
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -264,6 +280,10 @@ def adjust(
         KeyboardInterrupt: Ctrl-C during the solve, once Ceres has stopped.
         FloatingPointError: the reduced system is not finite.
     """
+    if problem.num_waves and not (
+        problem.on_rays or problem.pinned_pose is not None or anchor_weights is not None or plane_deviations is not None
+    ):
+        return _adjust_whole(problem, settings, on_progress)
     chunks = split(problem, settings.num_threads)
     if anchor_weights is not None:
         for chunk in chunks:
@@ -279,6 +299,49 @@ def adjust(
     finally:
         if pool is not None:
             pool.shutdown()
+
+
+def _adjust_whole(
+    problem: Problem, settings: SolverSettings, on_progress: Callable[[Progress], None] | None
+) -> Adjustment:
+    """`adjust` without Ceres, for the wide blocks of waves."""
+    system = Whole(problem, settings.num_threads)
+    tolerances = Tolerances(
+        max_num_iterations=settings.max_num_iterations,
+        function=settings.function_tolerance,
+        gradient=settings.gradient_tolerance,
+        parameter=settings.parameter_tolerance,
+        initial_radius=settings.initial_trust_region_radius,
+    )
+
+    def on_step(iteration: int, cost: float, steepest: float, length: float, accepted: bool) -> None:
+        if on_progress is not None:
+            rms = float(np.sqrt(2.0 * cost / max(len(problem.tracks.image), 1)))
+            on_progress(
+                Progress(
+                    iteration=iteration, cost=cost, rms=rms, gradient_max_norm=steepest, step_norm=length,
+                    successful=accepted,
+                )
+            )  # fmt: skip
+
+    pool = ThreadPoolExecutor(settings.num_threads) if settings.num_threads > 1 else None
+    try:
+        found = descend(system, tolerances, pool, on_step)
+    finally:
+        if pool is not None:
+            pool.shutdown()
+    termination: Termination = "convergence" if found.converged else "no_convergence"
+    return Adjustment(
+        state=apply(problem.state, system.change(found.x)),
+        points=found.points,
+        cost=found.cost,
+        initial_cost=found.initial_cost,
+        num_iterations=found.num_iterations,
+        termination="failure" if found.converged is None else termination,
+        message=found.message,
+        gradient_max_norm=found.gradient_max_norm,
+        seconds=found.seconds,
+    )
 
 
 def _solve(

@@ -128,10 +128,10 @@ class Problem:
     @property
     def optics(self) -> Optics:
         """The media at the state's index, for compiled code."""
-        return _optics(self.layers, self.state.index)
+        return media_at(self.layers, self.state.index)
 
 
-def _optics(layers: Layers, index: float) -> Optics:
+def media_at(layers: Layers, index: float) -> Optics:
     media = Media(layers.with_index(index))
     return Optics(media.ratio, media.ratio_by_index, media.walls)
 
@@ -140,7 +140,7 @@ def slot_width(slot: int, state: State) -> int:
     return (6, 3, 1, state.lens.shape[1], state.waves.shape[1], 3)[slot]
 
 
-def _image_blocks(problem: Problem, image: int) -> list[tuple[int, int]]:
+def image_blocks(problem: Problem, image: int) -> list[tuple[int, int]]:
     """The free blocks that an image depends on, as (slot, block)."""
     held, structure = problem.held, problem.structure
     blocks = []
@@ -217,13 +217,13 @@ class Chunk:
             lens=state.lens[cameras],
             waves=state.waves[images] if problem.num_waves else state.waves,
         )
-        self.keys: list[tuple[int, int]] = sorted({key for i in images for key in _image_blocks(problem, int(i))})
+        self.keys: list[tuple[int, int]] = sorted({key for i in images for key in image_blocks(problem, int(i))})
         self.widths = [slot_width(slot, state) for slot, _ in self.keys]
         self.first_column = dict(zip(self.keys, np.concatenate([[0], np.cumsum(self.widths)]).tolist(), strict=False))
         self.num_columns = int(sum(self.widths))
         self.columns = np.full((len(images), NUM_SLOTS), -1, dtype=np.int32)
         for row, image in enumerate(images):
-            for key in _image_blocks(problem, int(image)):
+            for key in image_blocks(problem, int(image)):
                 self.columns[row, key[0]] = self.first_column[key]
         self._place = {POSE: poses, PLANE: planes, MEDIUM: np.zeros(1, np.int64), LENS: cameras, WAVES: images}
         self._problem = problem
@@ -246,7 +246,7 @@ class Chunk:
         views = evaluate_views(self.structure, self.state, change, self.columns)
         if not (views.distance > 0.0).all() or self.state.index + change.index <= 0.0:
             return None
-        return views, _optics(self._problem.layers, self.state.index + change.index)
+        return views, media_at(self._problem.layers, self.state.index + change.index)
 
     def _run(self, pool: ThreadPoolExecutor | None, job: Callable[[int, int, int], Any]) -> list[Any]:
         if pool is None or len(self.slices) == 1:
@@ -297,7 +297,7 @@ class Chunk:
             pool,
             lambda k, a, b: elimination.reduce(
                 self.points, self._problem.held.points, self.anchors, a, b, self.tracks, views, optics,
-                *self._loss, matrices[k], gradients[k], self._problem.on_rays,
+                *self._loss, matrices[k], gradients[k], np.zeros((0, 0)), self._problem.on_rays,
             ),
         )  # fmt: skip
         for matrix, gradient in zip(matrices[1:], gradients[1:], strict=True):
@@ -337,12 +337,12 @@ def split(problem: Problem, num_threads: int) -> list[Chunk]:
     centers = -np.einsum("nji,nj->ni", rotation, translation)
     lengths = np.diff(tracks.start)
     observer = np.add.reduceat(centers[tracks.image], tracks.start[:-1], axis=0) / lengths[:, None]
-    own = np.array([sum(slot_width(s, problem.state) for s, _ in _image_blocks(problem, i) if s != MEDIUM)
+    own = np.array([sum(slot_width(s, problem.state) for s, _ in image_blocks(problem, i) if s != MEDIUM)
                     for i in range(structure.num_images)])  # fmt: skip
     parts: list[NDArray[np.int64]] = []
     pending = [np.arange(num_points)]
     total = sum(slot_width(s, problem.state) for s, _ in {k for i in range(structure.num_images)
-                                                           for k in _image_blocks(problem, i)})  # fmt: skip
+                                                           for k in image_blocks(problem, i)})  # fmt: skip
     while pending:
         part = pending.pop()
         if total > MAX_CHUNK_COLUMNS and len(part) > 200:

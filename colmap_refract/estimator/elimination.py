@@ -555,7 +555,23 @@ def _subtract_outer(matrix, row, column, factors, a, b, height, width):
             for j in range(3):
                 matrix[row + i, column + j] -= a0 * factors[b, 0, j] + a1 * factors[b, 1, j] + a2 * factors[b, 2, j]
     else:
-        for i in range(height):
+        # Four rows at a time: what a column of B takes to load serves them all.
+        whole = height - height % 4
+        for i in range(0, whole, 4):
+            a0, a1, a2 = factors[a, 0, i], factors[a, 1, i], factors[a, 2, i]
+            b0, b1, b2 = factors[a, 0, i + 1], factors[a, 1, i + 1], factors[a, 2, i + 1]
+            c0, c1, c2 = factors[a, 0, i + 2], factors[a, 1, i + 2], factors[a, 2, i + 2]
+            d0, d1, d2 = factors[a, 0, i + 3], factors[a, 1, i + 3], factors[a, 2, i + 3]
+            r = row + i
+            for j in range(width):
+                x, y, z = factors[b, 0, j], factors[b, 1, j], factors[b, 2, j]
+                m0 = matrix[r, column + j] - (a0 * x + a1 * y + a2 * z)
+                m1 = matrix[r + 1, column + j] - (b0 * x + b1 * y + b2 * z)
+                m2 = matrix[r + 2, column + j] - (c0 * x + c1 * y + c2 * z)
+                m3 = matrix[r + 3, column + j] - (d0 * x + d1 * y + d2 * z)
+                matrix[r, column + j], matrix[r + 1, column + j] = m0, m1
+                matrix[r + 2, column + j], matrix[r + 3, column + j] = m2, m3
+        for i in range(whole, height):
             a0, a1, a2 = factors[a, 0, i], factors[a, 1, i], factors[a, 2, i]
             for j in range(width):
                 matrix[row + i, column + j] -= a0 * factors[b, 0, j] + a1 * factors[b, 1, j] + a2 * factors[b, 2, j]
@@ -583,7 +599,7 @@ def _add_outer(matrix, row, column, weight, by_blocks, a, b, height, width):
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def reduce(
-    points, hold_points, anchors, first_track, stop_track, tracks, views, optics, loss, scale, matrix, gradient,
+    points, hold_points, anchors, first_track, stop_track, tracks, views, optics, loss, scale, matrix, gradient, rows,
     on_rays=False,
 ):  # fmt: skip
     """Add the reduced system of settled points to `matrix` and `gradient`.
@@ -597,7 +613,9 @@ def reduce(
         loss, scale: robust loss and its scale in pixels.
         matrix: (n, n), the upper triangle is added to (blocks on the diagonal are filled).
         gradient: (n,).
-        on_rays: as for `settle`; not for points that are known.
+        rows: (3 m, n) of the m points of the range, zero: what is left here, times itself, remains to be subtracted
+            from the matrix, for whoever multiplies that of many points at once. (0, 0): subtracted here.
+        on_rays: as for `settle`; not for points that are known, nor with rows.
 
     Returns:
         The summed cost.
@@ -722,7 +740,16 @@ def reduce(
                     w0, w1, w2 = _forward(lower, coupling[a, 0, j], coupling[a, 1, j], coupling[a, 2, j])
                     coupling[a, 0, j], coupling[a, 1, j], coupling[a, 2, j] = w0, w1, w2
                     gradient[column + j] -= w0 * y0 + w1 * y1 + w2 * y2
-            for a in range(num_touched):
+            if rows.shape[0] > 0:
+                for a in range(num_touched):
+                    column = touched_column[a]
+                    for row in range(3):
+                        for j in range(touched_width[a]):
+                            rows[3 * (p - first_track) + row, column + j] = coupling[a, row, j]
+                left = 0
+            else:
+                left = num_touched
+            for a in range(left):
                 column = touched_column[a]
                 width = touched_width[a]
                 for b in range(num_touched):

@@ -144,6 +144,60 @@ def deviations(structure: Structure, state: State, level: LevelPlane) -> Array:
     )
 
 
+def all_to_level(
+    structure: Structure, state: State, images: NDArray[np.int64], pose: Array, plane: Array, level: LevelPlane,
+    change: Array,
+) -> tuple[Array, Array, Array, Array]:  # fmt: skip
+    """`compare_to_level` of all plane blocks at once.
+
+    Args:
+        structure, state: of B blocks.
+        images: (B,) one of each block.
+        pose: (B, 6) changes of these images' poses; plane: (B, 3) of the planes; change: (3,) of the level plane.
+
+    Returns:
+        `(deviation, by_pose, by_plane, by_level)`, (B, 4), (B, 4, 6), (B, 4, 3), (B, 4, 3).
+    """
+    count, frame = len(images), structure.image_pose[images]
+    turn, left = exp_and_left_jacobian(pose[:, :3])
+    rotation = turn @ state.rotation[frame]
+    back = rotation.transpose(0, 2, 1)
+    translation = np.einsum("nij,nj->ni", turn, state.translation[frame]) + pose[:, 3:]
+    sensor, shift = structure.sensor_rotation[images], structure.sensor_translation[images]
+    arm = -np.einsum("nji,nj->ni", sensor, shift)
+    center = np.einsum("nij,nj->ni", back, arm - translation)
+    center_by_pose = np.concatenate([back @ cross_matrix(arm - pose[:, 3:]) @ left, -back], axis=2)
+    normal, turned = turn_normals(state.normal, plane[:, :2])
+    by_change = np.concatenate([turned, np.zeros((count, 3, 1))], axis=2)
+    distance = state.distance + plane[:, 2]
+    in_world = structure.plane_in_world
+    # Planes of the world have a distance from their anchor; others turn with their camera.
+    lever = structure.plane_anchor - center
+    in_rig = np.einsum("nji,nj->ni", sensor, normal)
+    normal_by_pose = np.zeros((count, 3, 6))
+    normal_by_pose[:, :, :3] = np.where(in_world[:, None, None], 0.0, back @ cross_matrix(in_rig) @ left)
+    normal_by_plane = np.where(in_world[:, None, None], by_change, back @ sensor.transpose(0, 2, 1) @ by_change)
+    standing = np.where(in_world[:, None], normal, np.einsum("nij,nj->ni", back, in_rig))
+    distance_by_plane = np.where(in_world[:, None], np.einsum("nij,ni->nj", by_change, lever), 0.0)
+    distance_by_plane[:, 2] += 1.0
+    distance_by_pose = np.where(in_world[:, None], -np.einsum("ni,nij->nj", normal, center_by_pose), 0.0)
+    distance = distance + np.where(in_world, np.einsum("ni,ni->n", normal, lever), 0.0)
+    common, leaned = level.moved(change)
+    reach = level.anchor - center
+    expected = common.distance + reach @ common.normal
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.where(np.minimum(distance, expected) > 0, np.log(distance / expected), np.nan)
+    deviation = np.column_stack([standing - common.normal, ratio])
+    ratio_by_pose = distance_by_pose / distance[:, None] + common.normal @ center_by_pose / expected[:, None]
+    by_pose = np.concatenate([normal_by_pose, ratio_by_pose[:, None]], axis=1)
+    by_plane = np.concatenate([normal_by_plane, (distance_by_plane / distance[:, None])[:, None]], axis=1)
+    by_level = np.zeros((count, 4, 3))
+    by_level[:, :3, :2] = -leaned
+    by_level[:, 3, :2] = -reach @ leaned / expected[:, None]
+    by_level[:, 3, 2] = -1.0 / expected
+    return deviation, by_pose, by_plane, by_level
+
+
 @dataclass(frozen=True, kw_only=True)
 class PriorBlock:
     """One further residual block: the parameter blocks that it looks at, and what it says of their values.

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from colmap_refract.estimator.elimination import Views
 from colmap_refract.estimator.rotation import cross_matrix, exp_and_left_jacobian
-from colmap_refract.interface import Array, tangent_basis
+from colmap_refract.interface import Array
 from colmap_refract.options import Scenario
 
 SCENARIOS: tuple[Scenario, ...] = get_args(Scenario)
@@ -147,11 +147,21 @@ class Change:
         )
 
 
+def tangent_bases(normals: Array) -> Array:
+    """`tangent_basis` of each of (B, 3) normals, (B, 3, 2)."""
+    axis = np.where(np.abs(normals[:, :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    first = axis - np.einsum("bi,bi->b", axis, normals)[:, None] * normals
+    first /= np.linalg.norm(first, axis=1)[:, None]
+    x, y, z = normals.T
+    a, b, c = first.T
+    return np.stack([first, np.column_stack([y * c - z * b, z * a - x * c, x * b - y * a])], axis=2)
+
+
 def turn_normals(normals: Array, tangential: Array) -> tuple[Array, Array]:
     """Unit normals (B, 3) after tangential changes (B, 2), and their derivative by them (B, 3, 2)."""
     if not len(normals):
         return normals, np.zeros((0, 3, 2))
-    basis = np.stack([tangent_basis(n) for n in normals])
+    basis = tangent_bases(normals)
     moved = normals + np.einsum("bij,bj->bi", basis, tangential)
     norm = np.linalg.norm(moved, axis=1)
     normal = moved / norm[:, None]

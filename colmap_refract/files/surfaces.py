@@ -12,6 +12,7 @@ camera, white on the plane, blue towards the water.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -40,12 +41,18 @@ _SHOWN = 99.5
 """Percentage of all heights that the colours tell apart: a single wild place would leave the others white."""
 
 
-def write_surfaces(folder: Path, reconstruction: pycolmap.Reconstruction, sidecar: Sidecar) -> None:
+def write_surfaces(
+    folder: Path,
+    reconstruction: pycolmap.Reconstruction,
+    sidecar: Sidecar,
+    on_image: Callable[[int, int], None] = lambda done, total: None,
+) -> None:
     """Write the surfaces of a model's images, where there are any, to `folder / "surfaces"`; otherwise nothing.
 
     Args:
         folder: that the model is written to, such as that of `output_folder`.
         reconstruction, sidecar: the model and its interfaces; images without a pose are passed over.
+        on_image: called before each image, with how many are done, of how many.
 
     Raises:
         OSError: something cannot be written.
@@ -60,7 +67,8 @@ def write_surfaces(folder: Path, reconstruction: pycolmap.Reconstruction, sideca
     surfaces = folder / SURFACES_NAME
     stems = surface_stems(name for name, image in sidecar.images.items() if image.surface is not None)
     maps = []
-    for name, image in images.items():
+    for done, (name, image) in enumerate(images.items()):
+        on_image(done, len(images))
         heights = seen_heights(sight(image.camera), sidecar.images[name])
         path = surfaces / (stems[name] + HEIGHTS_SUFFIX)
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -82,7 +82,12 @@ def refine_model(
             result = _refine(workspace, database, model, options, complete_tracks, notes, cameras)
             write_model(result.reconstruction, folder)
             write_sidecar(result.sidecar, folder / SIDECAR_NAME)
-            write_surfaces(folder, result.reconstruction, result.sidecar)
+            write_surfaces(
+                folder,
+                result.reconstruction,
+                result.sidecar,
+                lambda done, total: workspace.watcher.progress("Surfaces", done, total, "images"),
+            )
             # Noted before the folder changes hands, so that neither the old nor the new one is taken for a stranger's.
             new = fingerprint(folder)
             record.begin(REFINEMENT, inputs)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_refract.estimator import elimination
-from colmap_refract.estimator.adjustment import Adjustment, Progress, SolverSettings, adjust, settle_points
+from colmap_refract.estimator.adjustment import Adjustment, Progress, SolverSettings, adjust, part_done, settle_points
 from colmap_refract.estimator.chunk import Problem, robust_cost
 from colmap_refract.estimator.triangulation import triangulate
 from colmap_refract.interface import Array
@@ -528,3 +528,10 @@ def named(watch: Watch | None, stage: str) -> Callable[[Progress], None] | None:
     if watch is None:
         return None
     return lambda progress: watch(stage, progress)
+
+
+def counted(watch: Watch | None, stage: str) -> Callable[[int, int], None]:
+    """Tells the watch how many parts of a stage are done, of how many."""
+    if watch is None:
+        return lambda done, total: None
+    return lambda done, total: watch(stage, part_done(done, total))

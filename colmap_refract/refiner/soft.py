@@ -13,7 +13,7 @@ from colmap_refract.estimator.adjustment import Adjustment, SolverSettings, adju
 from colmap_refract.estimator.chunk import LevelPrior, Problem
 from colmap_refract.interface import Array, plane_in_cam
 from colmap_refract.refiner.arrangement import Arrangement, select_tracks
-from colmap_refract.refiner.continuation import Watch, named, residuals, retriangulate
+from colmap_refract.refiner.continuation import Watch, counted, named, residuals, retriangulate
 from colmap_refract.refiner.filtering import Filtered, filter_observations, in_cameras, predicted_directions
 from colmap_refract.refiner.start import image_depths, viewing_directions, world_plane
 from colmap_refract.refiner.wave_statistics import estimate_statistics, log_evidence, raw_residuals
@@ -48,6 +48,8 @@ _EXPLAINED = 0.7
 _MOST_ITERATIONS = 30
 _FINER = 1e-8
 """Function tolerance: the design changes between solves."""
+_FAR, _NEAR = 1e4, 1e6
+"""Radii of the first trust region, before there is a solution and from one: smaller ones double the iterations."""
 _MOST_FIRST, _NUM_UPDATES = 6, 3
 """Solves with a guess of the statistics, until the points stay, and with what they then say of them."""
 _STAYS = 0.15
@@ -196,7 +198,7 @@ class _Solver:
             statistics = replace(statistics, wavelength=length)
         if statistics.wavelength < _SHORTEST_RESOLVED * self.width:
             num_modes = 0
-        wavy = with_waves(self.flat, statistics, num_modes, current)
+        wavy = with_waves(self.flat, statistics, num_modes, current, counted(self.watch, f"{stage}, surfaces"))
         scale = _LOSS_SCALE_IN_NOISE * statistics.noise
         if wide:
             # Before waves are known, all residuals are large; wrong matches are larger.
@@ -206,6 +208,7 @@ class _Solver:
             self.settings,
             max_num_iterations=min(self.settings.max_num_iterations, _MOST_ITERATIONS),
             function_tolerance=max(self.settings.function_tolerance, _FINER),
+            initial_trust_region_radius=_FAR if wide else _NEAR,
         )
         posed = frozen(problem)
         adjustment = adjust(posed, quick, on_progress=named(self.watch, stage))
@@ -252,7 +255,8 @@ def solve_soft(
     if few[keep].all():
         return _last_rounds(solver, found.wavy.problem, found.statistics, found.level)
     whole = _Solver(_part(start, keep), options, settings, watch)
-    return _last_rounds(whole, spread_waves(found.wavy, whole.flat), found.statistics, found.level)
+    spread = spread_waves(found.wavy, whole.flat, counted(watch, "Waves, all observations"))
+    return _last_rounds(whole, spread, found.statistics, found.level)
 
 
 def _find_waves(solver: _Solver, options: WaveOptions) -> Round:
@@ -313,7 +317,8 @@ def _with_statistics(solver: _Solver, found: Round) -> Round:
     """Say anew how steep the waves are, and solve again, until that stays."""
     for _ in range(_NUM_UPDATES):
         before = found.statistics
-        statistics, level = _updated(found, solver.options)
+        counted(solver.watch, "Wave statistics, update")(0, 1)
+        statistics, level = _updated(found, solver.options, solver.settings.num_threads)
         found = _solve_once(solver, found.wavy.problem, statistics, level)
         if abs(np.log(statistics.slope_deviation / before.slope_deviation)) < _STAYS:
             break
@@ -323,17 +328,23 @@ def _with_statistics(solver: _Solver, found: Round) -> Round:
 def _shows_waves(solver: _Solver, found: Round) -> bool:
     """Whether waves make the data more probable than still water does."""
     still = replace(found.statistics, slope_deviation=float(_STILL), unresolved=1.0)
-    flat = _solve_once(solver, found.wavy.problem, still, found.level)
-    for _ in range(_NUM_UPDATES):
-        statistics, level = estimate_statistics(flat.wavy, flat.solved, flat.statistics, given_slope=True)
-        flat = _solve_once(solver, flat.wavy.problem, statistics, level)
+    try:
+        flat = _solve_once(solver, found.wavy.problem, still, found.level)
+        for _ in range(_NUM_UPDATES):
+            statistics, level = estimate_statistics(
+                flat.wavy, flat.solved, flat.statistics, given_slope=True, num_threads=solver.settings.num_threads
+            )
+            flat = _solve_once(solver, flat.wavy.problem, statistics, level)
+    except Unsupported:
+        # Flat water that comes to no solution explains nothing.
+        return True
     return _evidence(solver, found) > _evidence(solver, flat)
 
 
 def _evidence(solver: _Solver, found: Round) -> float:
     """Log probability of the data with a round's statistics."""
     whitening = float(np.log(np.linalg.det(found.wavy.whiten)).sum())
-    return log_evidence(found.solved, found.statistics.noise, whitening)
+    return log_evidence(found.solved, found.statistics.noise, whitening, solver.settings.num_threads)
 
 
 def _last_rounds(
@@ -378,12 +389,13 @@ def go_on(
     return _last_rounds(solver, _part(everywhere, keep), soft.statistics, soft.level, most=1)
 
 
-def settle_everywhere(start: Problem, soft: SoftSolution) -> Problem:
+def settle_everywhere(start: Problem, soft: SoftSolution, watch: Watch | None = None) -> Problem:
     """All observations at a solution of some, weighted as those are."""
     solved = soft.wavy.problem
     flat = replace(start, held=solved.held, wave_prior=None, level_prior=None)
-    spread = spread_waves(soft.wavy, flat)
-    wavy = with_waves(flat, soft.statistics, solved.num_waves, spread)
+    on_image = counted(watch, "Waves, all observations")
+    spread = spread_waves(soft.wavy, flat, on_image)
+    wavy = with_waves(flat, soft.statistics, solved.num_waves, spread, on_image)
     return replace(wavy.problem, loss=solved.loss, loss_scale=solved.loss_scale)
 
 
@@ -466,9 +478,11 @@ def _width(flat: Problem) -> float:
     return float(np.median(widths))
 
 
-def _updated(found: Round, options: WaveOptions) -> tuple[WaveStatistics, LevelPrior | None]:
+def _updated(found: Round, options: WaveOptions, num_threads: int) -> tuple[WaveStatistics, LevelPrior | None]:
     given = options.slope_deviation is not None
-    statistics, level = estimate_statistics(found.wavy, found.solved, found.statistics, given_slope=given)
+    statistics, level = estimate_statistics(
+        found.wavy, found.solved, found.statistics, given_slope=given, num_threads=num_threads
+    )
     before = found.level
     if level is not None and before is not None:
         level = replace(

@@ -10,7 +10,7 @@ from colmap_refract.errors import RefractError
 from colmap_refract.estimator.adjustment import SolverSettings
 from colmap_refract.files.sidecar import Sidecar
 from colmap_refract.refiner.arrangement import Arrangement
-from colmap_refract.refiner.continuation import Watch, is_sound, residuals
+from colmap_refract.refiner.continuation import Watch, counted, is_sound, residuals
 from colmap_refract.refiner.filtering import reprojection_errors
 from colmap_refract.refiner.plane_solution import solve_planes
 from colmap_refract.refiner.selection import Selection
@@ -49,15 +49,16 @@ def solve_waves(
         remark = f"{unsupported}; the interfaces are taken to be flat."
         return replace(solve_planes(arrangement, settings, earlier, watch), remarks=(remark,))
     active, _ = selection.active()
+    counted(watch, "Uncertainties")(0, 1)
     return Solution(
         selection=selection,
         problem=soft.wavy.problem,
         adjustment=soft.adjustment,
-        uncertainty=estimate_uncertainty(soft.solved),
+        uncertainty=estimate_uncertainty(soft.solved, settings.num_threads),
         noise=soft.statistics.noise,
         residuals=residuals(soft.solved),
         errors=reprojection_errors(soft.wavy.problem, active.observations),
-        describe=lambda sidecar, scale: add_waves(sidecar, active, soft, scale),
+        describe=lambda sidecar, scale: add_waves(sidecar, active, soft, scale, counted(watch, "Surfaces")),
     )
 
 
@@ -96,7 +97,7 @@ def _solve_soft(
         if changed <= NEGLIGIBLE_CHANGE:
             break
         soft = go_on(begin, everywhere, keep, soft, settings, watch)
-        everywhere = settle_everywhere(begin, soft)
+        everywhere = settle_everywhere(begin, soft, watch)
     if not keep.all() and len(soft.wavy.problem.tracks.image) != int(keep.sum()):
         soft = go_on(begin, everywhere, keep, soft, settings, watch)
     problem = soft.wavy.problem

@@ -18,15 +18,19 @@ from scipy.linalg import null_space
 from scipy.sparse.linalg import splu
 
 from colmap_refract.estimator.adjustment import SolverSettings, settle_points
+from colmap_refract.estimator.banded import factorize
 from colmap_refract.estimator.chunk import Problem, change_of, slot_width
 from colmap_refract.estimator.elimination import LEVEL, MEDIUM, PLANE, POSE
 from colmap_refract.estimator.priors import mean_plane
 from colmap_refract.estimator.scenario import apply
+from colmap_refract.estimator.whole import evaluated
 from colmap_refract.interface import Array, tangent_basis
 from colmap_refract.refiner.normal_equations import Key, normal_equations
 
 _STEP = 1e-4
 """Radians, or of the median depth: small against what moves a point by much, large against how well it is settled."""
+_GAUGE_JITTER = 1e-10
+"""Of the scaled diagonal."""
 _FOLLOWED_POINTS = 200
 _MOST_FOLLOWED = 600
 """Unknowns of a held camera's planes, each of which costs a solve of the followed points."""
@@ -148,11 +152,12 @@ def _growth_of_points(problem: Problem, keys: list[Key], columns: dict[Key, int]
     return growth
 
 
-def estimate_uncertainty(problem: Problem) -> Uncertainty:
+def estimate_uncertainty(problem: Problem, num_threads: int = 1) -> Uncertainty:
     """Covariances of planes and index at a solution.
 
     Args:
         problem: with `state` and `points` at the solution.
+        num_threads: to evaluate it with.
 
     Returns:
         `Uncertainty`, per pixel of noise; NaN for planes that are held or undetermined.
@@ -162,6 +167,8 @@ def estimate_uncertainty(problem: Problem) -> Uncertainty:
     unknown = Uncertainty(
         normal=nan, distance=nan.copy(), index=np.nan, index_correlation=np.nan, decrement=0.0, determined=False
     )
+    if problem.num_waves:
+        return _with_waves(problem, unknown, num_threads)
     system = normal_equations(problem)
     if system is None or not system.keys:
         return unknown
@@ -235,3 +242,61 @@ def estimate_uncertainty(problem: Problem) -> Uncertainty:
         normal=normal, distance=distance, index=index, index_correlation=correlation,
         decrement=abs(decrement), determined=determined,
     )  # fmt: skip
+
+
+def _with_waves(problem: Problem, unknown: Uncertainty, num_threads: int) -> Uncertainty:
+    """`estimate_uncertainty` on the banded system: the free index, which waves would take up, is held with them."""
+    found = evaluated(problem, num_threads)
+    if found is None:
+        return unknown
+    system, cost, gradient, matrix = found
+    n, held = system.num_columns, system.held_columns
+    if not (matrix.diagonal > 0).all():
+        return unknown
+    scale = 1.0 / np.sqrt(matrix.diagonal)
+    matrix.scale(scale)
+    matrix.add_diagonal(_GAUGE_JITTER)
+    factor = factorize(matrix)
+    if factor is None:
+        return unknown
+    directions = gauge(problem, system.keys, system.columns, n)
+    on_poses = np.zeros(n, dtype=np.bool_)
+    for key, first in system.columns.items():
+        on_poses[first : first + system.widths[key]] = key[0] == POSE
+    size_known = True
+    if on_poses.any() or not directions.shape[1]:
+        constraint = directions * on_poses[:, None] * scale[:, None]
+    elif n - len(held) <= _MOST_FOLLOWED:
+        constraint = (_growth_of_points(problem, system.keys, system.columns, n) * scale)[:, None]
+    else:
+        constraint, size_known = directions * scale[:, None], False
+    constraint[held] = 0.0
+    norms = np.linalg.norm(constraint, axis=0)
+    constraint = constraint[:, norms > 0] / norms[norms > 0]
+    # What the gauge leaves free is large, by the jitter; under the constraint it is not.
+    answer = factor.solve(constraint)
+    within = np.linalg.inv(constraint.T @ answer)
+    slope = gradient * scale
+    step = factor.solve(slope)
+    step = step - answer @ (within @ (constraint.T @ step))
+    decrement = float(0.5 * slope @ step / max(cost, 1e-300))
+    inverse = factor.inverse()
+    free = np.ones(n, dtype=np.bool_)
+    free[held] = False
+    normal, distance, determined = unknown.normal.copy(), unknown.distance.copy(), True
+    for (slot, b), first in system.columns.items():
+        if slot != PLANE:
+            continue
+        here = np.arange(first, first + 3)
+        here = here[free[here]]
+        block = inverse.block(here) - answer[here] @ within @ answer[here].T
+        block = block * scale[here] * scale[here][:, None]
+        variance = np.diag(block)
+        if not (np.isfinite(block).all() and (variance > 0).all()):
+            determined = False
+            continue
+        if free[first]:
+            normal[b] = np.sqrt(np.linalg.eigvalsh(block[:2, :2])[-1])
+        if free[first + 2] and size_known:
+            distance[b] = np.sqrt(variance[-1])
+    return replace(unknown, normal=normal, distance=distance, decrement=abs(decrement), determined=determined)

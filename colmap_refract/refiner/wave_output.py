@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -17,12 +18,22 @@ _CORRELATION_PER_WAVELENGTH = 1.0 / (np.sqrt(2.0) * np.pi)
 """A sinusoid near its crests is like a field of this correlation length."""
 
 
-def add_waves(sidecar: Sidecar, arrangement: Arrangement, soft: SoftSolution, scale: float) -> None:
-    """Put the surfaces and the statistics of the waves into the sidecar; lengths become the output's by `scale`."""
+def add_waves(
+    sidecar: Sidecar,
+    arrangement: Arrangement,
+    soft: SoftSolution,
+    scale: float,
+    on_image: Callable[[int, int], None] = lambda done, total: None,
+) -> None:
+    """Put the surfaces and the statistics of the waves into the sidecar; lengths become the output's by `scale`.
+
+    `on_image` is called before each image, with how many are done, of how many.
+    """
     problem, statistics = soft.wavy.problem, soft.statistics
     tracks = problem.tracks
     normal, distance = problem.state.planes_in_cam(problem.structure)
     for i, name in enumerate(arrangement.observations.image_names):
+        on_image(i, len(soft.wavy.modes))
         shapes = soft.wavy.modes[i]
         if shapes is None:
             continue

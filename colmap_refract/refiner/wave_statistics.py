@@ -10,14 +10,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag, cho_factor, cho_solve
+from scipy.linalg import block_diag
 
+from colmap_refract.estimator.banded import Inverse, factorize
 from colmap_refract.estimator.chunk import LevelPrior, Problem
 from colmap_refract.estimator.elimination import LEVEL, PLANE, POSE, WAVES
 from colmap_refract.estimator.priors import compare_to_level, first_images, images_with_waves, mean_plane, plane_stands
+from colmap_refract.estimator.whole import evaluated
 from colmap_refract.interface import Array, tangent_basis
 from colmap_refract.refiner.continuation import residuals
-from colmap_refract.refiner.normal_equations import NormalEquations, normal_equations
 from colmap_refract.refiner.waves import WaveStatistics, Wavy
 
 _JITTER = 1e-9
@@ -41,35 +42,49 @@ _KEPT_SQUARE = 0.9535
 
 @dataclass(frozen=True, kw_only=True)
 class Posterior:
-    """The normal equations at a solution, with what the statistics need of their inverse.
+    """What the statistics need of the inverse of the normal equations at a solution.
 
     Attributes:
-        system: in px^2.
-        covariance: (n, n) of the parameters for residuals of unit noise.
+        columns: where each free block, (slot, block), begins; widths: of each.
+        variance: (n,) of the parameters, for residuals of unit noise.
+        inverse: of the scaled equations, as far as their band reaches; scale: (n,).
     """
 
-    system: NormalEquations
-    covariance: Array
+    columns: dict[tuple[int, int], int]
+    widths: dict[tuple[int, int], int]
+    variance: Array
+    inverse: Inverse
+    scale: Array
+
+    def covariance(self, columns: Array) -> Array:
+        """(k, k) at columns of blocks that one image or all images look at."""
+        scale = self.scale[columns]
+        return np.asarray(self.inverse.block(columns) * scale * scale[:, None])
 
 
-def posterior(problem: Problem) -> Posterior | None:
-    """None where the system cannot be evaluated; dense, so for some hundred to a few thousand unknowns."""
-    system = normal_equations(problem)
-    if system is None or not system.keys:
+def posterior(problem: Problem, num_threads: int = 1) -> Posterior | None:
+    """None where the system cannot be evaluated or has no free parameter."""
+    found = evaluated(problem, num_threads)
+    if found is None:
         return None
-    matrix = system.hessian.toarray()
-    diagonal = np.diag(matrix).copy()
+    system, _, _, matrix = found
+    diagonal = matrix.diagonal
     if not (diagonal > 0).all():
         return None
     scale = 1.0 / np.sqrt(diagonal)
-    scaled = matrix * scale * scale[:, None]
-    scaled[np.diag_indices_from(scaled)] += _JITTER
-    inverse = cho_solve(cho_factor(scaled), np.eye(len(scaled)))
-    return Posterior(system=system, covariance=inverse * scale * scale[:, None])
+    matrix.scale(scale)
+    matrix.add_diagonal(_JITTER)
+    factor = factorize(matrix)
+    if factor is None:
+        return None
+    inverse = factor.inverse()
+    return Posterior(
+        columns=system.columns, widths=system.widths, variance=inverse.diagonal * scale**2, inverse=inverse, scale=scale
+    )
 
 
 def estimate_statistics(
-    wavy: Wavy, solved: Problem, statistics: WaveStatistics, *, given_slope: bool
+    wavy: Wavy, solved: Problem, statistics: WaveStatistics, *, given_slope: bool, num_threads: int = 1
 ) -> tuple[WaveStatistics, LevelPrior | None]:
     """One update of slope deviation, noise and level prior at a solution with waves.
 
@@ -81,23 +96,23 @@ def estimate_statistics(
         solved: what was solved, at its solution.
         statistics: that it was solved with.
         given_slope: whether the slope deviation stays as it is.
+        num_threads: to evaluate it with.
     """
     level = solved.level_prior
-    found = posterior(solved)
+    found = posterior(solved, num_threads)
     if found is None:
         return statistics, level
-    system, variance = found.system, np.diag(found.covariance)
     unit = statistics.noise**2
     determined, squared = 0.0, 0.0
     for image in images_with_waves(solved).tolist():
-        if (WAVES, image) not in system.columns:
+        if (WAVES, image) not in found.columns:
             continue
-        first = system.columns[WAVES, image]
+        first = found.columns[WAVES, image]
         mine = np.arange(first, first + solved.num_waves)
-        determined += float((1.0 - np.minimum(unit * variance[mine], 1.0)).sum())
+        determined += float((1.0 - np.minimum(unit * found.variance[mine], 1.0)).sum())
         squared += float((solved.state.waves[image] ** 2).sum())
     unknowns = 3 * len(solved.points) + determined
-    unknowns += sum(width for key, width in system.widths.items() if key[0] in (POSE, PLANE))
+    unknowns += sum(width for key, width in found.widths.items() if key[0] in (POSE, PLANE))
     grown, noise = _settle_residuals(wavy, solved, statistics, unknowns)
     slope, unresolved = statistics.slope_deviation, statistics.unresolved
     if not given_slope:
@@ -155,7 +170,7 @@ def _without_outliers(squares: Array) -> NDArray[np.bool_]:
 
 def _scatter(problem: Problem, level: LevelPrior, found: Posterior, noise: float) -> LevelPrior:
     """The level prior with the spread that the planes show."""
-    structure, state, system = problem.structure, problem.state, found.system
+    structure, state = problem.structure, problem.state
     plane = mean_plane(structure, state)
     along = block_diag(tangent_basis(plane.normal).T, 1.0)
     deviations, variances = [], []
@@ -164,12 +179,20 @@ def _scatter(problem: Problem, level: LevelPrior, found: Posterior, noise: float
         standing = plane_stands(structure, state, block, image, np.zeros(6), np.zeros(3))
         deviation, *by = compare_to_level(standing, plane, np.zeros(3))
         deviation, by = along @ deviation, [along @ part for part in by]
-        jacobian = np.zeros((3, len(system.gradient)))
-        for key, part in zip([(POSE, pose), (PLANE, block), (LEVEL, 0)], by, strict=True):
-            if key in system.columns:
-                jacobian[:, system.columns[key] : system.columns[key] + system.widths[key]] += part
+        free = [
+            (key, part)
+            for key, part in zip([(POSE, pose), (PLANE, block), (LEVEL, 0)], by, strict=True)
+            if key in found.columns
+        ]
         deviations.append(deviation)
-        variances.append(noise**2 * np.einsum("ij,jk,ik->i", jacobian, found.covariance, jacobian))
+        if not free:
+            variances.append(np.zeros(3))
+            continue
+        jacobian = np.hstack([part for _, part in free])
+        covariance = found.covariance(
+            np.concatenate([found.columns[key] + np.arange(found.widths[key]) for key, _ in free])
+        )
+        variances.append(noise**2 * np.einsum("ij,jk,ik->i", jacobian, covariance, jacobian))
     squared, variance = np.array(deviations) ** 2, np.array(variances)
     if not np.isfinite(squared).all() or not np.isfinite(variance).all():
         return level
@@ -189,25 +212,25 @@ def _deviation(squared: Array, variance: Array, assumed: float) -> float:
     return float(assumed * np.clip(factor, 1.0 / _LARGEST_FACTOR, _LARGEST_FACTOR))
 
 
-def log_evidence(problem: Problem, noise: float, log_whitening: float) -> float:
+def log_evidence(problem: Problem, noise: float, log_whitening: float, num_threads: int = 1) -> float:
     """Log probability of the data at a solution, up to a constant: what the choice of a wavelength goes by.
 
     Args:
         problem: at its solution.
         noise: px.
         log_whitening: sum of the log determinants of the observations' whitening.
+        num_threads: to evaluate it with.
     """
-    system = normal_equations(problem)
-    if system is None:
+    found = evaluated(problem, num_threads)
+    if found is None:
         return -np.inf
-    hessian = system.hessian
-    mine = [
-        np.arange(system.columns[key], system.columns[key] + system.widths[key])
-        for key in system.keys
-        if key[0] == WAVES
-    ]
+    system, cost, _, matrix = found
+    mine = [np.arange(first, first + system.widths[key]) for key, first in system.columns.items() if key[0] == WAVES]
     volume = 0.0
     if mine:
-        at = np.concatenate(mine)
-        volume = 0.5 * float(np.linalg.slogdet(hessian[at][:, at].toarray() / noise**2)[1])
-    return -system.cost / noise**2 - volume + log_whitening - 2.0 * len(problem.tracks.image) * float(np.log(noise))
+        at = np.sort(np.concatenate(mine))
+        factor = factorize(matrix.part(at))
+        if factor is None:
+            return -np.inf
+        volume = 0.5 * (factor.log_determinant - 2.0 * len(at) * float(np.log(noise)))
+    return -cost / noise**2 - volume + log_whitening - 2.0 * len(problem.tracks.image) * float(np.log(noise))

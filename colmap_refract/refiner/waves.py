@@ -13,6 +13,7 @@ Two things keep the solution from being biased, and both matter more than the pi
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -74,7 +75,13 @@ class Wavy:
     whiten: Array
 
 
-def with_waves(flat: Problem, statistics: WaveStatistics, num_modes: int, current: Problem | None = None) -> Wavy:
+def with_waves(
+    flat: Problem,
+    statistics: WaveStatistics,
+    num_modes: int,
+    current: Problem | None = None,
+    on_image: Callable[[int, int], None] = lambda done, total: None,
+) -> Wavy:
     """Put waves on all surfaces of a problem.
 
     Args:
@@ -82,6 +89,7 @@ def with_waves(flat: Problem, statistics: WaveStatistics, num_modes: int, curren
         statistics: of the waves; the prior.
         num_modes: coefficients per image, at most; with 0 all slopes count as noise, and one coefficient does nothing.
         current: the latest solution of the same observations, with waves or not, to go on from; else `flat`'s state.
+        on_image: called before each image, with how many are done, of how many.
     """
     structure, tracks = flat.structure, flat.tracks
     solution = flat if current is None else current
@@ -104,6 +112,7 @@ def with_waves(flat: Problem, statistics: WaveStatistics, num_modes: int, curren
     coefficients = np.zeros((structure.num_images, num_modes))
     tolerance = _FIT * statistics.slope_deviation
     for image in np.flatnonzero(refracted).tolist():
+        on_image(image, structure.num_images)
         mine = np.flatnonzero((tracks.image == image) & np.isfinite(places).all(axis=1))
         if not len(mine) or not resolved:
             continue
@@ -136,17 +145,19 @@ def with_waves(flat: Problem, statistics: WaveStatistics, num_modes: int, curren
     )
 
 
-def spread_waves(wavy: Wavy, flat: Problem) -> Problem:
+def spread_waves(wavy: Wavy, flat: Problem, on_image: Callable[[int, int], None] = lambda done, total: None) -> Problem:
     """The surfaces of a solution before other observations of the same images.
 
     Args:
         wavy: at its solution.
         flat: the other observations, without waves; their points go where their rays meet behind the surfaces.
+        on_image: as for `with_waves`.
     """
     solution, tracks = wavy.problem, flat.tracks
     normal, _ = solution.state.planes_in_cam(solution.structure)
     waves = np.zeros((len(tracks.image), 3, solution.num_waves))
     for image, shapes in enumerate(wavy.modes):
+        on_image(image, len(wavy.modes))
         mine = np.flatnonzero(tracks.image == image)
         if shapes is None or not len(mine):
             continue
