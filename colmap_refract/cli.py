@@ -15,6 +15,7 @@ from colmap_refract import __version__
 from colmap_refract.commands.automatic_reconstructor import AutomaticReconstructor
 from colmap_refract.commands.camera_calibrator import CameraCalibrator
 from colmap_refract.commands.dense_reconstructor import DenseReconstructor
+from colmap_refract.commands.experiments import Experiments
 from colmap_refract.commands.flow_matcher import FlowMatcher
 from colmap_refract.commands.image_selector import ImageSelector
 from colmap_refract.commands.initial_mapper import InitialMapper
@@ -58,6 +59,7 @@ _COMMANDS = {
     "automatic_reconstructor": AutomaticReconstructor,
     "camera_calibrator": CameraCalibrator,
     "dense_reconstructor": DenseReconstructor,
+    "experiments": Experiments,
     "flow_matcher": FlowMatcher,
     "image_selector": ImageSelector,
     "initial_mapper": InitialMapper,

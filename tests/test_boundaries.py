@@ -124,11 +124,19 @@ LAYERS = [
     {"simulation.plan"},
     {"simulation.plan_report"},
     {"simulation"},
+    {"experiments.scenes", "experiments.results", "experiments.parallel"},
+    {"experiments.methods", "experiments.charts"},
+    {"experiments.measure", "experiments.tables"},
+    {"experiments.flat", "experiments.wavy", "experiments.brick", "experiments.pool", "experiments.page"},
+    {"experiments.body"},
+    {"experiments.mannequin"},
+    {"experiments.run"},
     {"commands.lists", "commands.progress"},
     {
         "commands.automatic_reconstructor", "commands.camera_calibrator", "commands.dense_reconstructor",
-        "commands.flow_matcher", "commands.image_selector", "commands.initial_mapper", "commands.model_analyzer",
-        "commands.point_triangulator", "commands.poisson_mesher", "commands.refiner", "commands.simulator",
+        "commands.experiments", "commands.flow_matcher", "commands.image_selector", "commands.initial_mapper",
+        "commands.model_analyzer", "commands.point_triangulator", "commands.poisson_mesher", "commands.refiner",
+        "commands.simulator",
     },
     {"cli"},
     {"__main__"},
@@ -145,12 +153,13 @@ LIBRARIES = {
         "files", "refiner.observations", "refiner.refinement", "refiner.outcome", "calibration", "mapping",
         "comparators", "reconstructor", "simulation", "commands.simulator",
     },
+    "matplotlib": {"experiments.charts"},
     "tyro": {"cli", "commands"},
     "cv2": {"files.surface_picture", "photographs", "frame_selection", "optical_flow", "calibration", "dense"},
 }  # fmt: skip
 """Which modules, or whole folders, may import a library at run time. For type checkers alone, everybody may."""
 
-HEAVY = ("numba", "pycolmap", "pyceres", "scipy", "cv2")
+HEAVY = ("numba", "pycolmap", "pyceres", "scipy", "cv2", "matplotlib")
 
 SOURCES = sorted(PACKAGE.rglob("*.py"))
 
@@ -227,9 +236,9 @@ def test_large_libraries_have_few_doors(library: str) -> None:
     assert users or not doors
 
 
-def test_only_commands_and_tests_know_the_simulation() -> None:
+def test_only_experiments_commands_and_tests_know_the_simulation() -> None:
     users = {folder(module_of(path)) for path in SOURCES if "simulation" in map(folder, own_imports(path))}
-    assert users <= {"simulation", "commands"}
+    assert users <= {"simulation", "experiments", "commands"}
 
 
 @pytest.mark.parametrize("module", ["colmap_refract", "colmap_refract.cli"])

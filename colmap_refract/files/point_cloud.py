@@ -50,6 +50,21 @@ def read_point_cloud(path: Path) -> tuple[Array, Array]:
     Raises:
         RefractError: there is no such file, it cannot be read, is no PLY file or cut off, or has no normals.
     """
+    points, normals = np.split(_read(path, ("x", "y", "z", "nx", "ny", "nz")), 2, axis=1)
+    return points, normals
+
+
+def read_points(path: Path) -> Array:
+    """Points (n, 3) of a PLY file, such as the vertices of a mesh, binary or text.
+
+    Raises:
+        RefractError: there is no such file, it cannot be read, is no PLY file or cut off.
+    """
+    return _read(path, ("x", "y", "z"))
+
+
+def _read(path: Path, wanted: tuple[str, ...]) -> Array:
+    """Properties (n, k) of a PLY file's vertices."""
     if not path.exists():
         raise RefractError(f"there is no file {path}; {_HINT}")
     if path.is_dir():
@@ -58,7 +73,7 @@ def read_point_cloud(path: Path) -> tuple[Array, Array]:
         with path.open("rb") as file:
             head = file.read(_LONGEST_HEADER)
             form, count, names, types, size = _parse(head, path)
-            lacking = [name for name in ("x", "y", "z", "nx", "ny", "nz") if name not in names]
+            lacking = [name for name in wanted if name not in names]
             if lacking:
                 what = "normals" if lacking[0].startswith("n") else "coordinates"
                 raise RefractError(f"the points of {path} have no {what} ({', '.join(lacking)}); {_HINT}")
@@ -79,10 +94,7 @@ def read_point_cloud(path: Path) -> tuple[Array, Array]:
         raise RefractError(f"{path} is not a PLY file of points, or it is damaged; {_HINT}") from None
     if not complete:
         raise RefractError(f"{path} is cut off: it ends before its {count} points do; write it again")
-    points, normals = (
-        np.column_stack([columns[name] for name in group.split()]).astype(np.float64) for group in ("x y z", "nx ny nz")
-    )
-    return points, normals
+    return np.column_stack([columns[name] for name in wanted]).astype(np.float64)
 
 
 def num_vertices(path: Path) -> int:

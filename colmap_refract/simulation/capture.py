@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -13,7 +14,7 @@ from colmap_refract.interface import Array, Layers, plane_in_world
 from colmap_refract.options import Scenario
 from colmap_refract.simulation import scene
 from colmap_refract.simulation.least_path import least_path_direction
-from colmap_refract.simulation.scene import Plane, SceneOptions, Station
+from colmap_refract.simulation.scene import Arrangement, Plane, SceneOptions, Station
 from colmap_refract.simulation.surface import Surface
 from colmap_refract.simulation.wave_path import least_crossings
 
@@ -75,24 +76,43 @@ class Capture:
         return np.asarray(surface.offset - self.crossings[image_id] @ surface.normal)
 
 
-def simulate(options: SceneOptions) -> Capture:
-    """Photograph a random scene through the interface.
+def simulate(
+    options: SceneOptions, arrangement: Arrangement | None = None, *, waves: Sequence[Array] | None = None
+) -> Capture:
+    """Photograph a scene through the interface: a random one, or what is given.
 
-    The floor has a relief of about a quarter of `scene_size`. Keypoints of points that no other image sees
-    are kept, without a 3D point, and point ids have gaps where points were left out.
+    The floor of a random scene has a relief of about a quarter of `scene_size`. Keypoints of points that no other
+    image sees are kept, without a 3D point, and point ids have gaps where points were left out.
+
+    Args:
+        options: of the camera, the noise and the waves; and of where things stand, for which they must be true (the
+            bounds go by them) also where it is given.
+        arrangement: targets, points and stations in place of what `scene.lay_out` draws.
+        waves: of each frame (W, 4), as `Surface` has them, in place of what the options' statistics draw.
 
     Raises:
-        RefractError: options that contradict each other, or an interface that reaches behind a camera.
+        RefractError: options that contradict each other or what is given, or an interface that reaches behind a
+            camera.
     """
     rng, wave_rng = np.random.default_rng(options.seed), np.random.default_rng([options.seed, 1])
-    plan = scene.lay_out(options, rng)
+    plan = arrangement if arrangement is not None else scene.lay_out(options, rng)
+    num_frames = options.num_images // options.sensors_per_frame
+    if len(plan.stations) != options.num_images or (waves is not None and len(waves) != num_frames):
+        raise RefractError(
+            f"{options.num_images} images of {num_frames} frames need as many stations and waves: got "
+            f"{len(plan.stations)} stations" + ("" if waves is None else f" and waves of {len(waves)} frames")
+        )
     points, cameras, sensors = plan.points, scene.cameras(options), scene.sensors_from_rig(options)
 
     reach = 0.9 * np.hypot(*options.footprint)
     views: list[_View] = []
     for station in plan.stations:
         # A rig looks through one surface.
-        surface = _surface(station, options, wave_rng) if station.sensor == 0 else views[-1].surface
+        if station.sensor > 0:
+            surface = views[-1].surface
+        else:
+            given = None if waves is None else waves[station.frame]
+            surface = _surface(station, options, wave_rng, given)
         target = plan.targets[station.frame]
         near = np.flatnonzero(np.linalg.norm(points[:, :2] - target, axis=1) < reach)
         in_cam = points[near] @ station.rotation.T + station.translation
@@ -187,9 +207,10 @@ def _world_plane(station: Station) -> Plane:
     return plane_in_world(*station.plane, station.rotation, station.translation)
 
 
-def _surface(station: Station, options: SceneOptions, rng: np.random.Generator) -> Surface:
-    """The interface at the moment that a station's images are taken at."""
-    waves = options.wave_statistics.draw(rng) if options.wave_slope_deg > 0 else np.empty((0, 4))
+def _surface(station: Station, options: SceneOptions, rng: np.random.Generator, waves: Array | None) -> Surface:
+    """The interface at the moment that a station's images are taken at, with waves that are given or drawn."""
+    if waves is None:
+        waves = options.wave_statistics.draw(rng) if options.wave_slope_deg > 0 else np.empty((0, 4))
     normal, offset = _world_plane(station)
     return Surface(normal=normal, offset=offset, layers=options.layers, waves=waves)
 
