@@ -147,7 +147,10 @@ def _waves(sidecar: Sidecar) -> list[str]:
         ]
     lines = [
         _row("Waves, slope (rms)", f"{_number(waves.get('slope_deviation_deg'))} deg"),
-        _row("Waves, dominant wavelength", f"about {_number(waves.get('wavelength'), 2)} {unit}"),
+        _row(
+            "Waves, dominant wavelength",
+            f"about {_number(waves['wavelength'], 2)} {unit}" if "wavelength" in waves else "too short to be resolved",
+        ),
         _row("Slopes that the surfaces take", f"{100 * waves.get('explained', 0.0):.4g} % of their variance"),
     ]
     if "level_tilt_deg" in waves:

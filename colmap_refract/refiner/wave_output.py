@@ -56,11 +56,15 @@ def add_waves(
     typical = scale * float(np.nanmedian(distance))
     given = arrangement.options
     waves = {
-        "slope_deviation_deg": float(np.degrees(np.arctan(statistics.slope_deviation))),
-        "wavelength": given.wavelength if given.wavelength is not None else statistics.wavelength * typical,
+        "slope_deviation_deg": float(np.degrees(np.arctan(statistics.total_slope(soft.wavy.explained)))),
         "explained": soft.wavy.explained,
         "noise_px": statistics.noise,
     }
+    # Of waves that no surface takes the length is a guess.
+    if given.wavelength is not None:
+        waves["wavelength"] = given.wavelength
+    elif soft.wavy.explained > 0:
+        waves["wavelength"] = statistics.wavelength * typical
     if soft.level is not None:
         waves["level_tilt_deg"] = float(np.degrees(soft.level.tilt))
         waves["level_lift"] = soft.level.lift
