@@ -55,8 +55,9 @@ def add_waves(
         sidecar.images[name] = replace(sidecar.images[name], surface=surface.scaled(scale * float(distance[i])))
     typical = scale * float(np.nanmedian(distance))
     given = arrangement.options
+    total = statistics.total_slope(soft.wavy.explained)
     waves = {
-        "slope_deviation_deg": float(np.degrees(np.arctan(statistics.total_slope(soft.wavy.explained)))),
+        "slope_deviation_deg": given.wave_slope_deg or float(np.degrees(np.arctan(total))),
         "explained": soft.wavy.explained,
         "noise_px": statistics.noise,
     }
