@@ -67,7 +67,8 @@ def _refined(
     options = replace(options, num_threads=1)
     result = refine(ignore_refraction(setup.capture) if start is None else start, options, notes=notes)
     remarks = [] if result.converged else ["not converged"]
-    if options.interface_shape == "soft" and all(image.surface is None for image in result.sidecar.images.values()):
+    # Ripples that are too short for a surface are waves too.
+    if options.interface_shape == "soft" and "waves" not in result.sidecar.statistics:
         remarks.append("no waves found, planes taken")
     return Estimate(points=points_of(result.reconstruction), remark=", ".join(remarks))
 

@@ -28,9 +28,9 @@ from colmap_refract.refiner.filtering import Filtered, filter_observations, repr
 from colmap_refract.refiner.own_normals import everywhere, slope_deviation
 from colmap_refract.refiner.reference_solution import SHRUNK, check_reference, poorly_tied
 from colmap_refract.refiner.selection import Selection
-from colmap_refract.refiner.soft import level_start, wave_options
-from colmap_refract.refiner.soft_solution import check_waves
-from colmap_refract.refiner.solution import Solution, from_scratch
+from colmap_refract.refiner.soft import wave_options
+from colmap_refract.refiner.soft_solution import check_waves, wavy_start
+from colmap_refract.refiner.solution import Solution
 from colmap_refract.refiner.uncertainty import Uncertainty
 
 MOST_UNKNOWNS = 60_000
@@ -59,13 +59,7 @@ def solve_as_printed(
     check_reference(arrangement, arrangement.start(0.5, observations))
     pairing = pair(arrangement.start(0.5, observations), arrangement.reference)
     _check_size(arrangement, pairing)
-    # From planes that were solved for, which lean against the waves, it ends farther off than from level ones.
-    if earlier is not None:
-        begin = arrangement.resume(earlier)
-    elif options.scenario == "fixed_camera":
-        begin = from_scratch(arrangement, settings, watch)
-    else:
-        begin = level_start(arrangement)
+    begin = wavy_start(arrangement, settings, earlier, watch)
     taking_part = np.concatenate([pairing.of_reference, pairing.others])
     radius = options.wave_radius if options.wave_radius is not None else _radius(arrangement, taking_part)
     smoothness = _smoothness(arrangement, begin, pairing, radius)

@@ -58,11 +58,8 @@ _MOST_FIRST, _NUM_WIDE, _NUM_UPDATES = 6, 2, 3
 say of the statistics."""
 _STAYS = 0.15
 """Relative change of the slope deviation that ends the search for it."""
-_MOST_LAST = 1
-"""Each round looks the waves up in the last one's solution, noise included: with steep waves further rounds move
-points by many times their deviation along what is hardly determined, at the same cost."""
-_SETTLED, _ALMOST_SETTLED = 0.05, 0.3
-"""Noise deviations by which predicted keypoints still move between rounds, the last and the first."""
+_SETTLED = 0.3
+"""Noise deviations by which predicted keypoints still move between solves."""
 _LOSS_SCALE_IN_NOISE = 4.0
 _WIDE = 4.0
 """Times the median residual: the scale of the loss of the first solves."""
@@ -93,6 +90,11 @@ class WaveOptions:
     tilt: float | None
     lift: float | None
     num_modes: int
+
+    @property
+    def knows_wavelength(self) -> bool:
+        """Whether the user said the wavelength, in either measure."""
+        return self.wavelength is not None or self.wavelength_in_depths is not None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -253,23 +255,23 @@ def solve_soft(
     few = keep & select_tracks(arrangement.observations, _FEW_OBSERVATIONS, arrangement.options.random_seed)
     check_support(arrangement, keep)
     solver = _Solver(_part(start, few), options, settings, watch)
-    found = _find_waves(solver, options)
+    found = _find_waves(solver)
     if not _shows_waves(solver, found):
         raise Unsupported("The surface shows no waves")
     if few[keep].all():
-        return _last_rounds(solver, found.wavy.problem, found.statistics, found.level)
+        return _last_solve(solver, found.wavy.problem, found.statistics, found.level)
     whole = _Solver(_part(start, keep), options, settings, watch)
     spread = spread_waves(found.wavy, whole.flat, counted(watch, "Waves, all observations"))
-    return _last_rounds(whole, spread, found.statistics, found.level)
+    return _last_solve(whole, spread, found.statistics, found.level)
 
 
-def _find_waves(solver: _Solver, options: WaveOptions) -> Round:
+def _find_waves(solver: _Solver) -> Round:
     """The statistics that make the data most probable, at a solution with them: swell or ripples first, then finer."""
     tried: list[tuple[float, float, Round]] = []
     failed: Unsupported | None = None
-    (swell, level), *ripples = _first_guesses(solver.flat, options)
+    (swell, *ripples), level = _first_guesses(solver)
     starts = [(_FIRST_SCALES[0], swell, first_modes) for first_modes in _FIRST_MODES]
-    starts += [(_FIRST_SCALES[1], statistics, ()) for statistics, _ in ripples]
+    starts += [(_FIRST_SCALES[1], statistics, ()) for statistics in ripples]
     for factor, statistics, first_modes in starts:
         if statistics is not swell and any(_is_explained(found) for *_, found in tried):
             continue
@@ -283,7 +285,7 @@ def _find_waves(solver: _Solver, options: WaveOptions) -> Round:
         assert failed is not None
         raise failed
     best, factor, found = max(tried, key=lambda one: one[0])
-    if options.wavelength is None and options.wavelength_in_depths is None:
+    if not solver.options.knows_wavelength:
         for _ in range(_MOST_SCALINGS):
             statistics = replace(found.statistics, wavelength=factor * found.statistics.wavelength)
             try:
@@ -323,7 +325,7 @@ def _settled(
         before = current
         found = _solve_once(solver, before, statistics, level, wide=not first_modes and number < _NUM_WIDE)
         current = found.wavy.problem
-        if before is not None and _change(before, current) < _ALMOST_SETTLED:
+        if before is not None and _change(before, current) < _SETTLED:
             break
     return found
 
@@ -337,7 +339,7 @@ def _with_statistics(solver: _Solver, found: Round) -> Round:
     for _ in range(_NUM_UPDATES):
         before = found.statistics
         counted(solver.watch, "Wave statistics, update")(0, 1)
-        statistics, level = _updated(found, solver.options, solver.settings.num_threads)
+        statistics, level = _updated(solver, found)
         found = _solve_once(solver, found.wavy.problem, statistics, level)
         if abs(np.log(statistics.slope_deviation / before.slope_deviation)) < _STAYS:
             break
@@ -366,38 +368,29 @@ def _evidence(solver: _Solver, found: Round) -> float:
     return log_evidence(found.solved, found.statistics.noise, whitening, solver.settings.num_threads)
 
 
-def _last_rounds(
-    solver: _Solver, current: Problem, statistics: WaveStatistics, level: LevelPrior | None, most: int = _MOST_LAST
+def _last_solve(
+    solver: _Solver, current: Problem, statistics: WaveStatistics, level: LevelPrior | None
 ) -> SoftSolution:
-    """All observations and modes, until the points stay."""
-    for number in range(most):
-        found = solver.solve(
-            current, statistics, level, solver.options.num_modes, stage=f"Waves, round {number + 1}", wide=number == 0
-        )
-        settled = number > 0 and _change(current, found.wavy.problem) < _SETTLED
-        current = found.wavy.problem
-        if settled:
-            break
+    """With all modes, once.
+
+    Another solve would look the waves up in this one's solution, noise included: with steep waves that moves points by
+    many times their deviation along what is hardly determined, at the same cost.
+    """
+    found = solver.solve(current, statistics, level, solver.options.num_modes, stage="Waves", wide=True)
     return SoftSolution(
         wavy=found.wavy, statistics=found.statistics, level=level, adjustment=found.adjustment, solved=found.solved
     )
 
 
 def go_on(
-    start: Problem,
-    everywhere: Problem,
-    keep: NDArray[np.bool_],
-    soft: SoftSolution,
-    settings: SolverSettings,
-    watch: Watch | None,
+    start: Problem, keep: NDArray[np.bool_], soft: SoftSolution, settings: SolverSettings, watch: Watch | None
 ) -> SoftSolution:
-    """The last solves again, with other observations.
+    """The last solve again, with fewer observations.
 
     Args:
-        start: of all observations, without waves.
-        everywhere: all observations at the solution, with waves.
+        start: of all N observations, without waves.
         keep: (N,) those that take part now.
-        soft: the solution so far.
+        soft: the solution so far, with all of them.
         settings, watch: as for `solve_soft`.
     """
     options = WaveOptions(
@@ -405,17 +398,7 @@ def go_on(
         lift=None, num_modes=soft.wavy.problem.num_waves,
     )  # fmt: skip
     solver = _Solver(_part(start, keep), options, settings, watch)
-    return _last_rounds(solver, _part(everywhere, keep), soft.statistics, soft.level, most=1)
-
-
-def settle_everywhere(start: Problem, soft: SoftSolution, watch: Watch | None = None) -> Problem:
-    """All observations at a solution of some, weighted as those are."""
-    solved = soft.wavy.problem
-    flat = replace(start, held=solved.held, wave_prior=None, level_prior=None)
-    on_image = counted(watch, "Waves, all observations")
-    spread = spread_waves(soft.wavy, flat, on_image)
-    wavy = with_waves(flat, soft.statistics, solved.num_waves, spread, on_image)
-    return replace(wavy.problem, loss=solved.loss, loss_scale=solved.loss_scale)
+    return _last_solve(solver, _part(soft.wavy.problem, keep), soft.statistics, soft.level)
 
 
 def filter_waves(arrangement: Arrangement, problem: Problem, noise: float) -> Filtered:
@@ -457,24 +440,24 @@ def _part(start: Problem, keep: NDArray[np.bool_]) -> Problem:
     return replace(start, tracks=start.tracks.take(first, keep), points=start.points[stays])
 
 
-def _first_guesses(flat: Problem, options: WaveOptions) -> list[tuple[WaveStatistics, LevelPrior | None]]:
-    """What to start from: each may end in another minimum."""
+def _first_guesses(solver: _Solver) -> tuple[list[WaveStatistics], LevelPrior | None]:
+    """What to start from: each of the waves may end in another minimum."""
+    options = solver.options
     level = None
     if options.level_prior:
         tilt = options.tilt if options.tilt is not None else float(_FIRST_TILT)
         lift = options.lift if options.lift is not None else _FIRST_LIFT
         level = LevelPrior(tilt=tilt, lift=lift, noise=_FIRST_WAVES[0].noise)
-    width = _width(flat)
-    waves = [replace(statistics, wavelength=statistics.wavelength * width) for statistics in _FIRST_WAVES]
-    if options.wavelength is not None:
-        waves = [replace(waves[0], wavelength=options.wavelength)]
-    elif options.wavelength_in_depths is not None:
-        waves = waves[:1]
-    if flat.held.poses.all():
-        waves = [replace(statistics, slope_deviation=float(_FIRST_SLOPE_AT_REST)) for statistics in waves]
-    if options.slope_deviation is not None:
-        waves = [replace(statistics, slope_deviation=options.slope_deviation) for statistics in waves]
-    return [(statistics, level) for statistics in waves]
+    waves = [replace(statistics, wavelength=statistics.wavelength * solver.width) for statistics in _FIRST_WAVES]
+    if options.knows_wavelength:
+        # In depths it is put into distances at each solve.
+        waves = [waves[0] if options.wavelength is None else replace(waves[0], wavelength=options.wavelength)]
+    slope = options.slope_deviation
+    if slope is None and solver.flat.held.poses.all():
+        slope = float(_FIRST_SLOPE_AT_REST)
+    if slope is not None:
+        waves = [replace(statistics, slope_deviation=slope) for statistics in waves]
+    return waves, level
 
 
 def _distance_in_depths(problem: Problem) -> float:
@@ -497,10 +480,14 @@ def _width(flat: Problem) -> float:
     return float(np.median(widths))
 
 
-def _updated(found: Round, options: WaveOptions, num_threads: int) -> tuple[WaveStatistics, LevelPrior | None]:
-    given = options.slope_deviation is not None
+def _updated(solver: _Solver, found: Round) -> tuple[WaveStatistics, LevelPrior | None]:
+    options = solver.options
     statistics, level = estimate_statistics(
-        found.wavy, found.solved, found.statistics, given_slope=given, num_threads=num_threads
+        found.wavy,
+        found.solved,
+        found.statistics,
+        given_slope=options.slope_deviation is not None,
+        num_threads=solver.settings.num_threads,
     )
     before = found.level
     if level is not None and before is not None:

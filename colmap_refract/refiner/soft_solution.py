@@ -8,6 +8,7 @@ import numpy as np
 
 from colmap_refract.errors import RefractError
 from colmap_refract.estimator.adjustment import SolverSettings
+from colmap_refract.estimator.chunk import Problem
 from colmap_refract.files.sidecar import Sidecar
 from colmap_refract.refiner.arrangement import Arrangement
 from colmap_refract.refiner.continuation import Watch, counted, is_sound, residuals
@@ -20,15 +21,13 @@ from colmap_refract.refiner.soft import (
     filter_waves,
     go_on,
     level_start,
-    settle_everywhere,
     solve_soft,
     wave_options,
 )
-from colmap_refract.refiner.solution import NEGLIGIBLE_CHANGE, Solution, from_scratch
+from colmap_refract.refiner.solution import Solution, from_scratch
 from colmap_refract.refiner.uncertainty import estimate_uncertainty
 from colmap_refract.refiner.wave_output import add_waves
 
-_NUM_WAVE_FILTERS = 1
 _LEAST_KEPT = 0.5
 """Part of the observations without which a solution with waves is none."""
 
@@ -71,35 +70,31 @@ def check_waves(arrangement: Arrangement) -> None:
         raise RefractError("a wall does not wave: use interface_shape plane, or leave out layer_thickness")
 
 
+def wavy_start(
+    arrangement: Arrangement, settings: SolverSettings, earlier: Sidecar | None, watch: Watch | None
+) -> Problem:
+    """All observations, before there are waves: planes that were solved for lean against them, level ones do not."""
+    if earlier is not None:
+        return arrangement.resume(earlier)
+    if arrangement.options.scenario == "fixed_camera":
+        return from_scratch(arrangement, settings, watch)
+    return level_start(arrangement)
+
+
 def _solve_soft(
     arrangement: Arrangement, settings: SolverSettings, earlier: Sidecar | None, watch: Watch | None
 ) -> tuple[Selection, SoftSolution]:
-    """Start on level water, solve with waves, filter and go on until nothing more comes or goes."""
-    options = arrangement.options
-    if earlier is not None:
-        begin = arrangement.resume(earlier)
-    elif options.scenario == "fixed_camera":
-        begin = from_scratch(arrangement, settings, watch)
-    else:
-        begin = level_start(arrangement)
-    everything = np.ones(len(begin.tracks.image), dtype=np.bool_)
-    soft = solve_soft(arrangement, begin, everything, wave_options(arrangement), settings, watch)
-    everywhere, keep = soft.wavy.problem, everything
-    marks = None
-    for _ in range(_NUM_WAVE_FILTERS):
-        marks = filter_waves(arrangement, everywhere, soft.statistics.noise)
-        counts = np.add.reduceat(marks.keep.astype(np.int64), begin.tracks.start[:-1])
-        remaining = marks.keep & np.repeat(counts >= 2, np.diff(begin.tracks.start))
-        changed = float((remaining != keep).mean())
-        keep = remaining
-        if keep.mean() < _LEAST_KEPT:
-            raise Unsupported("Waves are not determined: with them most observations are far off")
-        if changed <= NEGLIGIBLE_CHANGE:
-            break
-        soft = go_on(begin, everywhere, keep, soft, settings, watch)
-        everywhere = settle_everywhere(begin, soft, watch)
-    if not keep.all() and len(soft.wavy.problem.tracks.image) != int(keep.sum()):
-        soft = go_on(begin, everywhere, keep, soft, settings, watch)
+    """Start on level water, solve with waves, filter and solve again."""
+    begin = wavy_start(arrangement, settings, earlier, watch)
+    keep = np.ones(len(begin.tracks.image), dtype=np.bool_)
+    soft = solve_soft(arrangement, begin, keep, wave_options(arrangement), settings, watch)
+    marks = filter_waves(arrangement, soft.wavy.problem, soft.statistics.noise)
+    counts = np.add.reduceat(marks.keep.astype(np.int64), begin.tracks.start[:-1])
+    keep = marks.keep & np.repeat(counts >= 2, np.diff(begin.tracks.start))
+    if keep.mean() < _LEAST_KEPT:
+        raise Unsupported("Waves are not determined: with them most observations are far off")
+    if not keep.all():
+        soft = go_on(begin, keep, soft, settings, watch)
     problem = soft.wavy.problem
     if not is_sound(problem):
         raise Unsupported("Waves are not determined: with them the interface runs away from between cameras and points")
