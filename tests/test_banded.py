@@ -119,7 +119,7 @@ def wavy_problem(scenario: str, layout: str, num_images: int, num_points: int) -
     flat = level_start(arrangement)
     wavy = with_waves(flat, WaveStatistics(slope_deviation=0.02, wavelength=2.0, noise=0.3), 8).problem
     level = LevelPrior(tilt=0.03, lift=0.05, noise=0.3) if scenario == "moving_interface" else None
-    return frozen(replace(wavy, level_prior=level, loss="cauchy", loss_scale=3.0))
+    return frozen(replace(wavy, level_prior=level, loss="cauchy", loss_scale=3.0), bent=False)
 
 
 def dense_of(banded: Banded) -> Array:

@@ -926,3 +926,25 @@ def test_waves_have_a_prior_where_they_are_free_and_seen() -> None:
         assert block.num_residuals == 2
     held = replace(problem, wave_prior=prior, held=replace(problem.held, waves=True))
     assert prior_blocks(held) == []
+
+
+@pytest.mark.parametrize("scenario", ["static_interface", "moving_interface"])
+def test_a_relief_is_waves_that_are_held(scenario: Scenario) -> None:
+    """The same residuals, and the same system for all that is left, whichever way the surface is given."""
+    problem = with_waves(make_problem(scenario), 3, slope=0.02)
+    problem = replace(problem, held=replace(problem.held, waves=True))
+    tracks = problem.tracks
+    relief = np.einsum("nak,nk->na", tracks.waves, problem.state.waves[tracks.image])
+    assert np.abs(relief[:, 1:]).max() > 0.005
+    bent = replace(problem, tracks=tracks._replace(waves=np.zeros((0, 3, 0)), relief=relief))
+    np.testing.assert_allclose(kernel_residuals(bent), kernel_residuals(problem), atol=1e-10)
+    for ours, theirs in zip(
+        local_planes(bent.tracks, bent.structure, bent.state),
+        local_planes(tracks, problem.structure, problem.state),
+        strict=True,
+    ):
+        np.testing.assert_allclose(ours, theirs, atol=1e-14)
+    ours, theirs = (reduced(whole(each), some_parameters(whole(each), 0.0)) for each in (bent, problem))
+    for a, b in zip(ours, theirs, strict=True):
+        a, b = (np.triu(each) if np.ndim(each) == 2 else each for each in (a, b))
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max())

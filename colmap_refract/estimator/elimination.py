@@ -38,6 +38,7 @@ from colmap_refract.estimator.observed import (
     RESIDUAL,
     VALUES,
     from_local_plane,
+    is_wavy,
     local_plane,
 )
 from colmap_refract.estimator.on_ray import eliminate_length, refracted_ray
@@ -84,6 +85,8 @@ class Tracks(NamedTuple):
         scene: (N, 3, 3) world frame. With two rows of weights, residuals are these times the difference between the
             point and the observation's ray at the same depth along the third row, a unit vector; see
             `scene_residual`. (0, 3, 3): residuals are in the image.
+        relief: (N, 3) height and parts of the normal as in `waves`, as they are: nothing that is solved for moves
+            them. They take `sight`, too. (0, 3): none.
     """
 
     start: NDArray[np.int64]
@@ -97,6 +100,7 @@ class Tracks(NamedTuple):
     effects: Array = np.zeros((0, 2, 0))
     offset: Array = np.zeros((0, 2))
     scene: Array = np.zeros((0, 3, 3))
+    relief: Array = np.zeros((0, 3))
 
     def take(self, start: NDArray[np.int64], rows: NDArray[Any]) -> Tracks:
         """Some of the observations: `rows`, indices or a mask (N,), of points that begin at `start`."""
@@ -164,7 +168,7 @@ def _observe(k, point, tracks, views, optics, with_interface, out):
     nx, ny, nz = views.normal[i, 0], views.normal[i, 1], views.normal[i, 2]
     px, py, pz = 0.0, 0.0, 0.0
     d = views.distance[i]
-    waves = tracks.waves.shape[2] > 0
+    waves = is_wavy(tracks)
     height, length, t, facing = 0.0, 1.0, 0.0, 1.0
     if waves and tracks.wet[k]:
         nx, ny, nz, d, height, length, t, facing = local_plane(k, i, tracks, views)

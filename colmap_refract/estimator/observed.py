@@ -24,6 +24,12 @@ BY_SLOPE = 23  # 2 x 2, by the two parts of the local normal
 VALUES = 27
 
 
+@njit(cache=True, nogil=True, inline="always")
+def is_wavy(tracks):
+    """Whether each observation is refracted by a plane of its own."""
+    return tracks.waves.shape[2] > 0 or tracks.relief.shape[0] > 0
+
+
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", inline="always")
 def local_plane(k, i, tracks, views):
     """The tangent of the surface that waves refract observation `k` of image `i` by.
@@ -37,6 +43,8 @@ def local_plane(k, i, tracks, views):
     kx, ky, kz = tracks.sight[k, 0], tracks.sight[k, 1], tracks.sight[k, 2]
     facing = nx * kx + ny * ky + nz * kz
     height, first, second = 0.0, 0.0, 0.0
+    if tracks.relief.shape[0] > 0:
+        height, first, second = tracks.relief[k, 0], tracks.relief[k, 1], tracks.relief[k, 2]
     for q in range(tracks.waves.shape[2]):
         height += tracks.waves[k, 0, q] * views.waves[i, q]
         first += tracks.waves[k, 1, q] * views.waves[i, q]

@@ -14,7 +14,7 @@ import math
 
 from numba import njit
 
-from colmap_refract.estimator.observed import local_plane
+from colmap_refract.estimator.observed import is_wavy, local_plane
 from colmap_refract.estimator.optics import FAST
 
 _GUARD = 1e-11
@@ -62,7 +62,7 @@ def refracted_ray(k, tracks, views, optics, origin, ray):
     rx, ry, rz = ux, uy, uz
     if tracks.wet[k]:
         nx, ny, nz, d = views.normal[i, 0], views.normal[i, 1], views.normal[i, 2], views.distance[i]
-        if tracks.waves.shape[2] > 0:
+        if is_wavy(tracks):
             nx, ny, nz, d, _, _, _, _ = local_plane(k, i, tracks, views)
         last = optics.ratio.shape[0] - 1
         for layer in range(last):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba import njit
 
 from colmap_refract.estimator.optics import FAST
@@ -29,3 +30,12 @@ def robust(s, loss, scale):
     if loss == CAUCHY:
         return b * math.log1p(s / b), 1.0 / (1.0 + s / b)
     return s, 1.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def weights(squared, loss, scale):
+    """`rho'` (n,) of squared residuals (n,)."""
+    out = np.empty(squared.shape[0])
+    for k in range(squared.shape[0]):
+        out[k] = robust(squared[k], loss, scale)[1]
+    return out

@@ -28,6 +28,7 @@ from colmap_refract.estimator.observed import (
     IN_CAM,
     RESIDUAL,
     from_local_plane,
+    is_wavy,
     local_plane,
 )
 from colmap_refract.estimator.optics import FAST
@@ -56,7 +57,7 @@ def observe_in_scene(k, point, tracks, views, optics, with_interface, out):
     wz = rotation[i, 2, 0] * x + rotation[i, 2, 1] * y + rotation[i, 2, 2] * w
     ux, uy, uz = tracks.direction[k, 0], tracks.direction[k, 1], tracks.direction[k, 2]
     wet = tracks.wet[k]
-    waves = tracks.waves.shape[2] > 0
+    waves = is_wavy(tracks)
 
     nx, ny, nz, d = views.normal[i, 0], views.normal[i, 1], views.normal[i, 2], views.distance[i]
     height, length, t, facing = 0.0, 1.0, 0.0, 1.0

@@ -17,9 +17,12 @@ def local_planes(tracks: Tracks, structure: Structure, state: State) -> tuple[Ar
     """
     normal, distance = state.planes_in_cam(structure)
     normal, distance = normal[tracks.image], distance[tracks.image]
-    if tracks.waves.shape[2] == 0:
+    if tracks.waves.shape[2]:
+        height, *slopes = np.moveaxis(np.einsum("nak,nk->na", tracks.waves, state.waves[tracks.image]), 1, 0)
+    elif len(tracks.relief):
+        height, *slopes = tracks.relief.T
+    else:
         return normal, distance
-    height, *slopes = np.moveaxis(np.einsum("nak,nk->na", tracks.waves, state.waves[tracks.image]), 1, 0)
     facing = np.einsum("ni,ni->n", normal, tracks.sight)
     local = normal + np.einsum("nia,an->ni", structure.wave_axes[tracks.image], np.array(slopes))
     local /= np.linalg.norm(local, axis=1, keepdims=True)

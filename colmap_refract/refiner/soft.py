@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +18,7 @@ from colmap_refract.refiner.continuation import Watch, counted, named, residuals
 from colmap_refract.refiner.filtering import Filtered, filter_observations, in_cameras, predicted_directions
 from colmap_refract.refiner.start import image_depths, viewing_directions, world_plane
 from colmap_refract.refiner.wave_statistics import estimate_statistics, log_evidence, raw_residuals
-from colmap_refract.refiner.waves import WaveStatistics, Wavy, frozen, spread_waves, with_waves
+from colmap_refract.refiner.waves import WaveStatistics, Wavy, between, frozen, spread_waves, with_waves
 
 logger = logging.getLogger(__name__)
 
@@ -32,16 +33,16 @@ _STATISTICS_MODES = 24
 _FIRST_TILT, _FIRST_LIFT = np.radians(4.0), 0.1
 _FIRST_WAVES = (
     WaveStatistics(wavelength=2.0, slope_deviation=np.tan(np.radians(6.0)), noise=0.5, unresolved=0.1),
-    WaveStatistics(wavelength=0.1, slope_deviation=np.tan(np.radians(2.0)), noise=0.5),
+    WaveStatistics(wavelength=0.1, slope_deviation=np.tan(np.radians(4.0)), noise=0.5),
 )
 """A swell, and ripples; wavelengths over the width of what an image sees of its surface. Longer waves than that are
 tilts of its plane. A swell that is thought to be steeper than it is is found; one that is thought to be flat may not
 be. What is left of a smooth surface is noise rather than slopes."""
-_FIRST_SCALES = (0.5, 2.0)
-"""By which the wavelength of either is changed while the data become more probable."""
+_SCALES = (0.5, 1.4)
+"""By which the wavelength of a swell is changed while the data become more probable."""
 _FIRST_SLOPE_AT_REST = np.tan(np.radians(2.0))
 """For cameras whose poses are held: there the waves alone tell the depth of the water."""
-_SHORTEST_RESOLVED = 0.15
+_SHORTEST_RESOLVED = 0.3
 """Over the same width: some tens of modes say next to nothing of shorter waves, which all count as noise."""
 _STILL = np.tan(np.radians(0.01))
 """Slope deviation of water that is as good as flat."""
@@ -53,13 +54,23 @@ _FINER = 1e-8
 """Function tolerance: the design changes between solves."""
 _FAR, _NEAR = 1e4, 1e6
 """Radii of the first trust region, before there is a solution and from one: smaller ones double the iterations."""
-_MOST_FIRST, _NUM_WIDE, _NUM_UPDATES = 6, 2, 3
-"""Solves with a guess of the statistics, until the points stay, those of them with a wide loss, and with what they then
-say of the statistics."""
+_MOST_FIRST, _NUM_WIDE, _MOST_BETWEEN, _NUM_UPDATES = 6, 2, 4, 3
+"""Solves with a guess of the statistics, until the points stay, and those of them with a wide loss; solves between two
+updates of the statistics, and updates."""
 _STAYS = 0.15
 """Relative change of the slope deviation that ends the search for it."""
-_SETTLED = 0.3
-"""Noise deviations by which predicted keypoints still move between solves."""
+_SETTLED, _HOPELESS = 0.3, 5.0
+"""Noise deviations by which predicted keypoints still move between solves, and by which they move where there is no
+solution to come to."""
+_MOST_LAST, _CLOSE, _UNSETTLED = 8, 0.1, 2.0
+"""Last solves, at most; noise deviations by which predicted keypoints move between two of them in the end, and by which
+they may not. With a slope of 4 degrees it takes 7, with 1 degree 2."""
+_LOOSER = 5.0
+"""How much wider the level prior is where waves are not resolved, and stays. What is known of the planes is worth a few
+per cent there, but draws the interface towards where the planes need to scatter less."""
+_FAR_OFF = 10.0
+"""Noise deviations; a point that moves by more counts as if it moved by so much."""
+_SHORTEST_STEP = 0.2
 _LOSS_SCALE_IN_NOISE = 4.0
 _WIDE = 4.0
 """Times the median residual: the scale of the loss of the first solves."""
@@ -106,6 +117,7 @@ class Round:
         solved: what was solved, at its solution: the waves' effects as they stood.
         adjustment: the solver's word.
         statistics, level: the priors that it was solved with.
+        moved: noise deviations by which keypoints moved from the solution that the design is of.
     """
 
     wavy: Wavy
@@ -113,6 +125,7 @@ class Round:
     adjustment: Adjustment
     statistics: WaveStatistics
     level: LevelPrior | None
+    moved: float = np.inf
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,12 +210,13 @@ class _Solver:
         *,
         stage: str,
         wide: bool = False,
+        bent: bool = False,
     ) -> Round:
-        """One round: the design at the current solution, and a solve."""
+        """One round: the design at the current solution, and a solve; `bent` as for `frozen`."""
         if self.options.wavelength_in_depths is not None:
             length = self.options.wavelength_in_depths / _distance_in_depths(self.flat if current is None else current)
             statistics = replace(statistics, wavelength=length)
-        if statistics.wavelength < _SHORTEST_RESOLVED * self.width:
+        if not self.resolves(statistics):
             num_modes = 0
         wavy = with_waves(self.flat, statistics, num_modes, current, counted(self.watch, f"{stage}, surfaces"))
         scale = _LOSS_SCALE_IN_NOISE * statistics.noise
@@ -216,7 +230,7 @@ class _Solver:
             function_tolerance=max(self.settings.function_tolerance, _FINER),
             initial_trust_region_radius=_FAR if wide else _NEAR,
         )
-        posed = frozen(problem)
+        posed = frozen(problem, bent=bent)
         adjustment = adjust(posed, quick, on_progress=named(self.watch, stage))
         finite = np.isfinite(adjustment.state.distance).all() and np.isfinite(adjustment.points).all()
         if adjustment.termination == "failure" or not finite:
@@ -229,6 +243,10 @@ class _Solver:
             statistics=statistics,
             level=level,
         )
+
+    def resolves(self, statistics: WaveStatistics) -> bool:
+        """Whether modes say anything of waves that long."""
+        return statistics.wavelength >= _SHORTEST_RESOLVED * self.width
 
 
 def solve_soft(
@@ -258,44 +276,66 @@ def solve_soft(
     found = _find_waves(solver)
     if not _shows_waves(solver, found):
         raise Unsupported("The surface shows no waves")
+    soft = _last_solves(solver, found.wavy.problem, found.statistics, found.level)
     if few[keep].all():
-        return _last_solve(solver, found.wavy.problem, found.statistics, found.level)
+        return soft
     whole = _Solver(_part(start, keep), options, settings, watch)
-    spread = spread_waves(found.wavy, whole.flat, counted(watch, "Waves, all observations"))
-    return _last_solve(whole, spread, found.statistics, found.level)
+    spread = spread_waves(soft.wavy, whole.flat, counted(watch, "Waves, all observations"))
+    return _last_solves(whole, spread, soft.statistics, soft.level)
 
 
 def _find_waves(solver: _Solver) -> Round:
     """The statistics that make the data most probable, at a solution with them: swell or ripples first, then finer."""
-    tried: list[tuple[float, float, Round]] = []
+    tried: list[tuple[float, Round]] = []
     failed: Unsupported | None = None
     (swell, *ripples), level = _first_guesses(solver)
-    starts = [(_FIRST_SCALES[0], swell, first_modes) for first_modes in _FIRST_MODES]
-    starts += [(_FIRST_SCALES[1], statistics, ()) for statistics in ripples]
-    for factor, statistics, first_modes in starts:
-        if statistics is not swell and any(_is_explained(found) for *_, found in tried):
+    starts = [(swell, first_modes) for first_modes in _FIRST_MODES] + [(statistics, ()) for statistics in ripples]
+    for statistics, first_modes in starts:
+        if statistics is not swell and any(_is_explained(found) for _, found in tried):
             continue
         try:
-            found = _with_statistics(solver, _settled(solver, statistics, level, first_modes))
+            found = _with_statistics(solver, _first_solution(solver, statistics, _looser(solver, statistics, level), first_modes))
         except Unsupported as unsupported:
             failed = unsupported
             continue
-        tried.append((_evidence(solver, found), factor, found))
+        tried.append((_evidence(solver, found), found))
     if not tried:
         assert failed is not None
         raise failed
-    best, factor, found = max(tried, key=lambda one: one[0])
-    if not solver.options.knows_wavelength:
-        for _ in range(_MOST_SCALINGS):
-            statistics = replace(found.statistics, wavelength=factor * found.statistics.wavelength)
-            try:
-                other = _solve_once(solver, found.wavy.problem, statistics, found.level)
-            except Unsupported:
+    best, found = max(tried, key=lambda one: one[0])
+    if not solver.options.knows_wavelength and solver.resolves(found.statistics):
+        for factor in _SCALES:
+            better = _rescaled(solver, found, best, factor)
+            if better is not found:
+                found = _with_statistics(solver, better)
                 break
-            if (evidence := _evidence(solver, other)) <= best:
-                break
-            best, found = evidence, other
         logger.info("wavelength %.3g of the interface distance", found.statistics.wavelength)
+    return found
+
+
+def _looser(solver: _Solver, statistics: WaveStatistics, level: LevelPrior | None) -> LevelPrior | None:
+    """The level prior for waves of some length."""
+    if level is None or solver.resolves(statistics):
+        return level
+    given = solver.options
+    return replace(
+        level,
+        tilt=level.tilt * (1.0 if given.tilt is not None else _LOOSER),
+        lift=level.lift * (1.0 if given.lift is not None else _LOOSER),
+    )
+
+
+def _rescaled(solver: _Solver, found: Round, evidence: float, factor: float) -> Round:
+    """The solution with waves that are longer or shorter by a factor, again and again while that is more probable."""
+    for _ in range(_MOST_SCALINGS):
+        statistics = replace(found.statistics, wavelength=factor * found.statistics.wavelength)
+        try:
+            other = _solve_once(solver, found.wavy.problem, statistics, found.level)
+        except Unsupported:
+            break
+        if (rescaled := _evidence(solver, other)) <= evidence:
+            break
+        evidence, found = rescaled, other
     return found
 
 
@@ -307,26 +347,71 @@ def _solve_once(
     *,
     most_modes: int = _STATISTICS_MODES,
     wide: bool = False,
+    bent: bool = False,
 ) -> Round:
     num_modes = min(most_modes, solver.options.num_modes)
-    return solver.solve(current, statistics, level, num_modes, stage="Wave statistics", wide=wide)
+    return solver.solve(current, statistics, level, num_modes, stage="Wave statistics", wide=wide, bent=bent)
 
 
-def _settled(
+def _first_solution(
     solver: _Solver, statistics: WaveStatistics, level: LevelPrior | None, first_modes: tuple[int, ...]
 ) -> Round:
-    """Solve until the points stay: statistics of a solution that is far from its minimum would lead it astray."""
+    """A solution with a guess of the statistics."""
     current = None
     # What few modes leave is what the spectrum has there.
     rough = replace(statistics, unresolved=1.0)
     for most_modes in first_modes:
         current = _solve_once(solver, current, rough, level, most_modes=most_modes, wide=True).wavy.problem
-    for number in range(_MOST_FIRST):
+    return _settled(solver, current, statistics, level, _MOST_FIRST, num_wide=0 if first_modes else _NUM_WIDE)
+
+
+def _settled(
+    solver: _Solver,
+    current: Problem | None,
+    statistics: WaveStatistics,
+    level: LevelPrior | None,
+    most: int,
+    num_wide: int = 0,
+) -> Round:
+    """Solve until the points stay: statistics of a solution that is far from its minimum would lead it astray."""
+
+    def solve(current: Problem | None, number: int, bent: bool) -> Round:
+        return _solve_once(solver, current, statistics, level, wide=number < num_wide, bent=bent)
+
+    return _repeated(solve, current, most, _SETTLED)
+
+
+def _repeated(
+    solve: Callable[[Problem | None, int, bool], Round], current: Problem | None, most: int, close: float
+) -> Round:
+    """Solve, each time with the design at the solution before, until predicted keypoints stay.
+
+    Args:
+        solve: from a solution, with the number of the solve, and whether there are surfaces to bend the design by.
+        current: to begin with; None: no solution yet.
+        most: solves.
+        close: noise deviations by which keypoints still move.
+
+    Along what is hardly determined a design that is taken too far makes the next one come back too far: how much of
+    a step to go follows from two of them (Aitken's relaxation: Irons and Tuck 1969).
+    """
+    share, last, bent = 1.0, None, False
+    for number in range(most):
         before = current
-        found = _solve_once(solver, before, statistics, level, wide=not first_modes and number < _NUM_WIDE)
+        found = solve(before, number, bent)
         current = found.wavy.problem
-        if before is not None and _change(before, current) < _SETTLED:
+        if before is None:
+            continue
+        found = replace(found, moved=_change(before, current))
+        if found.moved < close:
             break
+        # Until then surfaces may be any.
+        bent = found.moved < _HOPELESS
+        move = _move(before, current)
+        if last is not None:
+            turned = move - last
+            share = float(np.clip(-share * np.vdot(last, turned) / np.vdot(turned, turned), _SHORTEST_STEP, 1.0))
+        current, last = between(before, current, share) if share < 1.0 else current, move
     return found
 
 
@@ -337,10 +422,13 @@ def _is_explained(found: Round) -> bool:
 def _with_statistics(solver: _Solver, found: Round) -> Round:
     """Say anew how steep the waves are, and solve again, until that stays."""
     for _ in range(_NUM_UPDATES):
+        if found.moved > _HOPELESS:
+            # Of no solution are there statistics.
+            break
         before = found.statistics
         counted(solver.watch, "Wave statistics, update")(0, 1)
         statistics, level = _updated(solver, found)
-        found = _solve_once(solver, found.wavy.problem, statistics, level)
+        found = _settled(solver, found.wavy.problem, statistics, level, _MOST_BETWEEN)
         if abs(np.log(statistics.slope_deviation / before.slope_deviation)) < _STAYS:
             break
     return found
@@ -368,15 +456,26 @@ def _evidence(solver: _Solver, found: Round) -> float:
     return log_evidence(found.solved, found.statistics.noise, whitening, solver.settings.num_threads)
 
 
-def _last_solve(
+def _last_solves(
     solver: _Solver, current: Problem, statistics: WaveStatistics, level: LevelPrior | None
 ) -> SoftSolution:
-    """With all modes, once.
+    """With all modes, until the points stay."""
 
-    Another solve would look the waves up in this one's solution, noise included: with steep waves that moves points by
-    many times their deviation along what is hardly determined, at the same cost.
-    """
-    found = solver.solve(current, statistics, level, solver.options.num_modes, stage="Waves", wide=True)
+    def solve(current: Problem | None, number: int, bent: bool) -> Round:
+        return solver.solve(
+            current, statistics, level, solver.options.num_modes, stage=f"Waves, solve {number + 1}",
+            wide=number == 0, bent=bent,
+        )  # fmt: skip
+
+    found = _repeated(solve, current, _MOST_LAST, _CLOSE)
+    if solver.resolves(statistics):
+        # Both come near and may drift away, one with planes that are free and the other with one that is not.
+        flat = _repeated(
+            lambda current, number, _: solve(current, number, False), found.wavy.problem, _MOST_LAST, _CLOSE
+        )
+        found = max(found, flat, key=lambda one: (one.moved <= _UNSETTLED, _evidence(solver, one)))
+    if found.moved > _UNSETTLED:
+        raise Unsupported("Waves are not determined: solutions with them do not settle")
     return SoftSolution(
         wavy=found.wavy, statistics=found.statistics, level=level, adjustment=found.adjustment, solved=found.solved
     )
@@ -398,7 +497,7 @@ def go_on(
         lift=None, num_modes=soft.wavy.problem.num_waves,
     )  # fmt: skip
     solver = _Solver(_part(start, keep), options, settings, watch)
-    return _last_solve(solver, _part(soft.wavy.problem, keep), soft.statistics, soft.level)
+    return _last_solves(solver, _part(soft.wavy.problem, keep), soft.statistics, soft.level)
 
 
 def filter_waves(arrangement: Arrangement, problem: Problem, noise: float) -> Filtered:
@@ -490,7 +589,9 @@ def _updated(solver: _Solver, found: Round) -> tuple[WaveStatistics, LevelPrior 
         num_threads=solver.settings.num_threads,
     )
     before = found.level
-    if level is not None and before is not None:
+    if not solver.resolves(found.statistics):
+        level = before
+    elif level is not None and before is not None:
         level = replace(
             level,
             tilt=before.tilt if options.tilt is not None else level.tilt,
@@ -501,11 +602,13 @@ def _updated(solver: _Solver, found: Round) -> tuple[WaveStatistics, LevelPrior 
 
 def _change(before: Problem, after: Problem) -> float:
     """How far the points moved between two rounds, over the noise in px, root mean square."""
-    moved: Array = _pixels_between(before, after)
+    return float(np.sqrt((_move(before, after) ** 2).sum(axis=1).mean()))
+
+
+def _move(before: Problem, after: Problem) -> Array:
+    """(N, 2) by how much predicted keypoints moved, over the noise; no farther than `_FAR_OFF`."""
     noise = after.wave_prior[0, 0, 0] if after.wave_prior is not None and after.num_waves else 1.0
-    return float(np.sqrt(np.mean(np.minimum(moved, 10.0 * noise) ** 2)) / noise)
-
-
-def _pixels_between(before: Problem, after: Problem) -> Array:
     change = predicted_directions(after) - predicted_directions(before)
-    return np.asarray(np.linalg.norm(np.einsum("nij,nj->ni", after.tracks.metric, change), axis=1))
+    moved = np.einsum("nij,nj->ni", after.tracks.metric, change) / noise
+    length = np.linalg.norm(moved, axis=1, keepdims=True)
+    return np.asarray(moved * (_FAR_OFF / np.maximum(length, _FAR_OFF)))

@@ -17,11 +17,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from colmap_refract.estimator import elimination
 from colmap_refract.estimator.adjustment import SolverSettings, settle_points
 from colmap_refract.estimator.chunk import Problem
 from colmap_refract.estimator.random_surface import Modes, RandomSurface, modes, node_grid
+from colmap_refract.estimator.robust import LOSSES, weights
 from colmap_refract.estimator.surface import local_planes
 from colmap_refract.interface import Array, tangent_basis
 from colmap_refract.refiner.continuation import residuals, retriangulate
@@ -216,11 +218,70 @@ def surface_effects(problem: Problem) -> Array:
     return out
 
 
-def frozen(wavy: Problem) -> Problem:
-    """The problem with the waves' effects on the pixels as they are at its state: linear in the coefficients."""
+def between(before: Problem, after: Problem, share: float) -> Problem:
+    """A state that has gone only a share of the way between two of the same observations, surfaces included."""
+    first, second, structure = before.state, after.state, after.structure
+
+    def mix(a: Array, b: Array) -> Array:
+        return (1.0 - share) * a + share * b
+
+    normal = mix(first.normal, second.normal)
+    turn = Rotation.from_matrix(second.rotation @ first.rotation.transpose(0, 2, 1)).as_rotvec()
+    relief = mix(relief_of(before, structure.wave_axes), relief_of(after, structure.wave_axes))
+    state = replace(
+        second,
+        rotation=Rotation.from_rotvec(share * turn).as_matrix() @ first.rotation,
+        translation=mix(first.translation, second.translation),
+        normal=normal / np.linalg.norm(normal, axis=1, keepdims=True),
+        distance=mix(first.distance, second.distance),
+        waves=np.ones((structure.num_images, 1)),
+    )
+    tracks = after.tracks._replace(waves=relief[:, :, None])
+    return replace(after, state=state, points=mix(before.points, after.points), tracks=tracks)
+
+
+def frozen(wavy: Problem, *, bent: bool) -> Problem:
+    """The problem with the waves' effects on the pixels as they are at its state: linear in the coefficients.
+
+    What points, poses and planes do to a pixel depends on the surface, too.
+
+    Args:
+        wavy: at a solution.
+        bent: take that at the surface that the other keypoints of the image show (`_by_others`); else at the plane.
+    """
     tracks = wavy.tracks
-    flat = replace(wavy, tracks=tracks._replace(waves=np.zeros((0, 3, 0)), sight=np.zeros((0, 3))))
     effects = surface_effects(wavy) @ tracks.waves
+    relief = _by_others(wavy, effects) if bent else np.zeros((0, 3))
+    if relief.any():
+        rest = tracks._replace(waves=np.zeros((0, 3, 0)), relief=relief)
+    else:
+        rest = tracks._replace(waves=np.zeros((0, 3, 0)), sight=np.zeros((0, 3)))
     now = np.einsum("nak,nk->na", effects, wavy.state.waves[tracks.image])
-    offset = residuals(wavy) - residuals(flat) - now
-    return replace(flat, tracks=flat.tracks._replace(effects=effects, offset=offset))
+    offset = residuals(wavy) - residuals(replace(wavy, tracks=rest)) - now
+    return replace(wavy, tracks=rest._replace(effects=effects, offset=offset))
+
+
+def _by_others(wavy: Problem, effects: Array) -> Array:
+    """(N, 3) height and parts of the normal of each keypoint's surface, as the others of its image have it.
+
+    The coefficients with one observation left out follow from those with all in closed form, at given points and
+    poses. A surface that follows a keypoint's own error would change what the point does to it by as much, always to
+    the same side: deeper water with smaller waves. Prediction by the others has no part in that error, and its
+    residual none in theirs (the argument of the jackknife instrumental variable: Angrist, Imbens and Krueger 1999).
+    """
+    tracks = wavy.tracks
+    relief = np.einsum("nak,nk->na", tracks.waves, wavy.state.waves[tracks.image])
+    if not relief.any() or wavy.wave_prior is None:
+        return relief
+    error = residuals(wavy)
+    weight = weights((error**2).sum(axis=1), LOSSES[wavy.loss], wavy.loss_scale)
+    for image in np.unique(tracks.image).tolist():
+        mine = np.flatnonzero(tracks.image == image)
+        factor = np.sqrt(weight[mine])[:, None]
+        mode, unit = factor[:, :, None] * effects[mine], wavy.wave_prior[image]
+        stacked = mode.reshape(-1, mode.shape[2])
+        by_mode = mode @ np.linalg.inv(stacked.T @ stacked + unit.T @ unit)
+        leverage = np.einsum("nak,nbk->nab", by_mode, mode)
+        left_out = np.linalg.solve(np.eye(2) - leverage, (factor * error[mine])[:, :, None])[:, :, 0]
+        relief[mine] += np.einsum("nak,nbk,nb->na", tracks.waves[mine], by_mode, left_out)
+    return relief
