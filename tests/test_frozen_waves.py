@@ -103,9 +103,7 @@ def test_between(wavy: Problem, share: float) -> None:
         return (1.0 - share) * a + share * b
 
     np.testing.assert_allclose(mixed.points, mix(wavy.points, other.points), atol=1e-12)
-    np.testing.assert_allclose(
-        relief_of(mixed, axes), mix(relief_of(wavy, axes), relief_of(other, axes)), atol=1e-12
-    )
+    np.testing.assert_allclose(relief_of(mixed, axes), mix(relief_of(wavy, axes), relief_of(other, axes)), atol=1e-12)
     np.testing.assert_allclose(mixed.state.rotation, mix(state.rotation, rotation), atol=1e-5)
     np.testing.assert_allclose(
         mixed.state.rotation @ mixed.state.rotation.transpose(0, 2, 1), np.tile(np.eye(3), (len(rotation), 1, 1)),

@@ -200,6 +200,9 @@ class _Solver:
         self.settings = settings
         self.watch = watch
         self.width = _width(self.flat)
+        # With planes that move freely a design at the planes may not settle; with one plane, or one camera, it does,
+        # and one at the surfaces drifts along what is hardly determined.
+        self.bends = flat.structure.num_planes > 1 and not held.poses.all()
 
     def solve(
         self,
@@ -294,7 +297,8 @@ def _find_waves(solver: _Solver) -> Round:
         if statistics is not swell and any(_is_explained(found) for _, found in tried):
             continue
         try:
-            found = _with_statistics(solver, _first_solution(solver, statistics, _looser(solver, statistics, level), first_modes))
+            first = _first_solution(solver, statistics, _looser(solver, statistics, level), first_modes)
+            found = _with_statistics(solver, first)
         except Unsupported as unsupported:
             failed = unsupported
             continue
@@ -376,7 +380,7 @@ def _settled(
     """Solve until the points stay: statistics of a solution that is far from its minimum would lead it astray."""
 
     def solve(current: Problem | None, number: int, bent: bool) -> Round:
-        return _solve_once(solver, current, statistics, level, wide=number < num_wide, bent=bent)
+        return _solve_once(solver, current, statistics, level, wide=number < num_wide, bent=bent and solver.bends)
 
     return _repeated(solve, current, most, _SETTLED)
 
@@ -467,13 +471,16 @@ def _last_solves(
             wide=number == 0, bent=bent,
         )  # fmt: skip
 
-    found = _repeated(solve, current, _MOST_LAST, _CLOSE)
-    if solver.resolves(statistics):
-        # Both come near and may drift away, one with planes that are free and the other with one that is not.
-        flat = _repeated(
-            lambda current, number, _: solve(current, number, False), found.wavy.problem, _MOST_LAST, _CLOSE
-        )
-        found = max(found, flat, key=lambda one: (one.moved <= _UNSETTLED, _evidence(solver, one)))
+    def at_planes(current: Problem | None, number: int, _: bool) -> Round:
+        return solve(current, number, False)
+
+    if not solver.bends:
+        found = _repeated(at_planes, current, _MOST_LAST, _CLOSE)
+    else:
+        found = _repeated(solve, current, _MOST_LAST, _CLOSE)
+        if solver.resolves(statistics):
+            flat = _repeated(at_planes, found.wavy.problem, _MOST_LAST, _CLOSE)
+            found = max(found, flat, key=lambda one: (one.moved <= _UNSETTLED, _evidence(solver, one)))
     if found.moved > _UNSETTLED:
         raise Unsupported("Waves are not determined: solutions with them do not settle")
     return SoftSolution(

@@ -270,7 +270,7 @@ def _by_others(wavy: Problem, effects: Array) -> Array:
     residual none in theirs (the argument of the jackknife instrumental variable: Angrist, Imbens and Krueger 1999).
     """
     tracks = wavy.tracks
-    relief = np.einsum("nak,nk->na", tracks.waves, wavy.state.waves[tracks.image])
+    relief: Array = np.einsum("nak,nk->na", tracks.waves, wavy.state.waves[tracks.image])
     if not relief.any() or wavy.wave_prior is None:
         return relief
     error = residuals(wavy)
