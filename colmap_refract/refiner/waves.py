@@ -7,8 +7,8 @@ Two things keep the solution from being biased, and both matter more than the pi
 
 - The surface is looked up where the *solution* sees a point, not where its keypoint is. A keypoint's noise moves the
   place, the slope there moves with it, and the product of the two looks like a lens.
-- The last solves take the waves' effects on the pixels as they stand (`frozen`): generalised least squares with
-  a known covariance. With effects that follow the solution, deeper water explains the same noise by smaller waves.
+- Solves take the waves' effects on the pixels as they stand (`frozen`): generalised least squares with a known
+  covariance. With effects that follow the solution, deeper water explains the same noise by smaller waves.
 """
 
 from __future__ import annotations
