@@ -24,6 +24,7 @@ from colmap_refract.commands.refiner import Refiner
 from colmap_refract.files.sidecar import SIDECAR_NAME, Sidecar, read_sidecar, write_sidecar
 from colmap_refract.interface import Array
 from colmap_refract.options import InterfaceShape, RefinerOptions, RefinerRequest, Scenario
+from colmap_refract.refiner import soft as soft_module
 from colmap_refract.refiner.diagnosis import SpatialCorrelation, spatial_correlation
 from colmap_refract.refiner.refinement import Refinement
 from colmap_refract.refiner.scenario_choice import choose_scenario
@@ -180,6 +181,28 @@ def test_without_level_prior(scenes: Scenes) -> None:
     assert "level_tilt_deg" not in free.sidecar.statistics["waves"]
     assert observations(free.reconstruction) == observations(scene.model)
     assert point_rmse(free.reconstruction, scene.capture) < point_rmse(scene.model, scene.capture)
+
+
+def test_ripples(scenes: Scenes) -> None:
+    """Too short to be resolved: noise that grows with depth, and no word of surfaces or of how planes scatter."""
+    scene = scenes("moving_interface", **{**WAVY, "wavelength": (0.02, 0.1)})
+    soft, hard = scene.refine(**SOFT), scene.refine(**{**SOFT, "interface_shape": "plane"})
+    waves = soft.sidecar.statistics["waves"]
+    assert 1.5 < waves["slope_deviation_deg"] < 2.5
+    assert "level_tilt_deg" not in waves and "wavelength" not in waves
+    assert all(entry.surface is None for entry in soft.sidecar.images.values())
+    error = point_rmse(soft.reconstruction, scene.capture)
+    assert error < point_rmse(hard.reconstruction, scene.capture)
+    assert error < 2.0 * bayesian_bound(scene.capture, level_prior=True)
+
+
+def test_solutions_that_do_not_settle_are_none(scenes: Scenes, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = scenes("static_interface", **SMALL)
+    monkeypatch.setattr(soft_module, "_UNSETTLED", 0.0)
+    unsettled = scene.refine(**SOFT)
+    (said,) = [warning for warning in unsettled.warnings if "Waves" in warning]
+    assert "do not settle" in said and "flat" in said
+    assert all(entry.surface is None for entry in unsettled.sidecar.images.values())
 
 
 # --- Surfaces and numbers --------------------------------------------------------------------------------------------

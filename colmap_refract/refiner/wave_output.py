@@ -66,7 +66,8 @@ def add_waves(
         waves["wavelength"] = given.wavelength
     elif soft.wavy.explained > 0:
         waves["wavelength"] = statistics.wavelength * typical
-    if soft.level is not None:
+    # Without a surface the scatter of the planes is not estimated.
+    if soft.level is not None and soft.wavy.explained > 0:
         waves["level_tilt_deg"] = float(np.degrees(soft.level.tilt))
         waves["level_lift"] = soft.level.lift
     sidecar.statistics["waves"] = waves
