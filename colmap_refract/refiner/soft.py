@@ -14,7 +14,7 @@ from colmap_refract.estimator.adjustment import Adjustment, SolverSettings, adju
 from colmap_refract.estimator.chunk import LevelPrior, Problem
 from colmap_refract.interface import Array, plane_in_cam
 from colmap_refract.refiner.arrangement import Arrangement, select_tracks
-from colmap_refract.refiner.continuation import Watch, counted, named, residuals, retriangulate
+from colmap_refract.refiner.continuation import Watch, counted, is_sound, named, residuals, retriangulate
 from colmap_refract.refiner.filtering import Filtered, filter_observations, in_cameras, predicted_directions
 from colmap_refract.refiner.start import image_depths, viewing_directions, world_plane
 from colmap_refract.refiner.wave_statistics import estimate_statistics, log_evidence, raw_residuals
@@ -35,14 +35,16 @@ _FIRST_WAVES = (
     WaveStatistics(wavelength=2.0, slope_deviation=np.tan(np.radians(6.0)), noise=0.5, unresolved=0.1),
     WaveStatistics(wavelength=0.1, slope_deviation=np.tan(np.radians(4.0)), noise=0.5),
 )
-"""A swell, and ripples; wavelengths over the width of what an image sees of its surface. Longer waves than that are
-tilts of its plane. A swell that is thought to be steeper than it is is found; one that is thought to be flat may not
+"""A swell, and ripples; wavelengths over the width of what an image sees of its surface. Longer waves than that
+are tilts of its plane. A swell that is thought to be steeper than it is is found; one that is thought to be flat may not
 be. What is left of a smooth surface is noise rather than slopes."""
+_CHOP = (0.4, 0.2)
+"""Wavelengths over the same width of what is between the two, and sought from a solution with ripples."""
 _SCALES = (0.5, 1.4)
 """By which the wavelength of a swell is changed while the data become more probable."""
 _FIRST_SLOPE_AT_REST = np.tan(np.radians(2.0))
 """For cameras whose poses are held: there the waves alone tell the depth of the water."""
-_SHORTEST_RESOLVED = 0.3
+_SHORTEST_RESOLVED = 0.15
 """Over the same width: some tens of modes say next to nothing of shorter waves, which all count as noise."""
 _STILL = np.tan(np.radians(0.01))
 """Slope deviation of water that is as good as flat."""
@@ -291,8 +293,8 @@ def _find_waves(solver: _Solver) -> Round:
     """The statistics that make the data most probable, at a solution with them: swell or ripples first, then finer."""
     tried: list[tuple[float, Round]] = []
     failed: Unsupported | None = None
-    (swell, *ripples), level = _first_guesses(solver)
-    starts = [(swell, first_modes) for first_modes in _FIRST_MODES] + [(statistics, ()) for statistics in ripples]
+    (swell, *shorter), level = _first_guesses(solver)
+    starts = [(swell, first_modes) for first_modes in _FIRST_MODES] + [(statistics, ()) for statistics in shorter]
     for statistics, first_modes in starts:
         if statistics is not swell and any(_is_explained(found) for _, found in tried):
             continue
@@ -306,7 +308,12 @@ def _find_waves(solver: _Solver) -> Round:
     if not tried:
         assert failed is not None
         raise failed
-    best, found = max(tried, key=lambda one: one[0])
+    found = tried[-1][1]
+    # Planes that move freely take up what little is known of such waves, and run away.
+    sought = not solver.options.knows_wavelength and not solver.bends
+    if sought and not solver.resolves(found.statistics) and _is_solution(found):
+        tried += _chop(solver, found, level)
+    best, found = max(tried, key=lambda one: (_is_solution(one[1]), one[0]))
     if not solver.options.knows_wavelength and solver.resolves(found.statistics):
         for factor in _SCALES:
             better = _rescaled(solver, found, best, factor)
@@ -315,6 +322,20 @@ def _find_waves(solver: _Solver) -> Round:
                 break
         logger.info("wavelength %.3g of the interface distance", found.statistics.wavelength)
     return found
+
+
+def _chop(solver: _Solver, ripples: Round, level: LevelPrior | None) -> list[tuple[float, Round]]:
+    """Solutions with waves that can be resolved in part, from one that takes all for noise."""
+    tried = []
+    for wavelength in _CHOP:
+        statistics = replace(ripples.statistics, wavelength=wavelength * solver.width)
+        try:
+            first = _settled(solver, ripples.wavy.problem, statistics, level, _MOST_FIRST)
+            found = _with_statistics(solver, first)
+        except Unsupported:
+            continue
+        tried.append((_evidence(solver, found), found))
+    return tried
 
 
 def _looser(solver: _Solver, statistics: WaveStatistics, level: LevelPrior | None) -> LevelPrior | None:
@@ -419,8 +440,13 @@ def _repeated(
     return found
 
 
+def _is_solution(found: Round) -> bool:
+    return found.moved <= _UNSETTLED and is_sound(found.wavy.problem)
+
+
 def _is_explained(found: Round) -> bool:
-    return float(np.median(np.abs(raw_residuals(found.wavy, found.solved)))) < _EXPLAINED
+    """Whether a swell leaves nothing for shorter waves."""
+    return _is_solution(found) and float(np.median(np.abs(raw_residuals(found.wavy, found.solved)))) < _EXPLAINED
 
 
 def _with_statistics(solver: _Solver, found: Round) -> Round:
