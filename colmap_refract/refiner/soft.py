@@ -36,7 +36,7 @@ _FIRST_WAVES = (
     WaveStatistics(wavelength=0.1, slope_deviation=np.tan(np.radians(4.0)), noise=0.5),
 )
 """A swell, and ripples; wavelengths over the width of what an image sees of its surface. Longer waves than that are
-tilts of its plane. A swell that is thought to be steeper than it is is found; one that is thought to be flat may not be.
+tilts of its plane. A swell that is thought to be steeper than it is is found; one that is thought to be flat may not.
 What is left of a smooth surface is noise rather than slopes."""
 _CHOP = (0.4, 0.2)
 """Wavelengths over the same width of what is between the two, and sought from a solution with ripples."""
