@@ -66,7 +66,7 @@ _SETTLED, _HOPELESS = 0.3, 5.0
 solution to come to."""
 _MOST_LAST, _CLOSE, _UNSETTLED = 8, 0.1, 2.0
 """Last solves, at most; noise deviations by which predicted keypoints move between two of them in the end, and by which
-they may not. With a slope of 4 degrees it takes 7, with 1 degree 2."""
+they may not. With a slope of 4 degrees it took 3 to 8."""
 _LOOSER = 5.0
 """How much wider the level prior is where waves are not resolved, and stays. What is known of the planes is worth a few
 per cent there, but draws the interface towards where the planes need to scatter less."""
@@ -217,7 +217,7 @@ class _Solver:
         wide: bool = False,
         bent: bool = False,
     ) -> Round:
-        """One round: the design at the current solution, and a solve; `bent` as for `frozen`."""
+        """One round: the design at the current solution, and a solve; `bent` as for `frozen`, where that settles."""
         if self.options.wavelength_in_depths is not None:
             length = self.options.wavelength_in_depths / _distance_in_depths(self.flat if current is None else current)
             statistics = replace(statistics, wavelength=length)
@@ -235,7 +235,7 @@ class _Solver:
             function_tolerance=max(self.settings.function_tolerance, _FINER),
             initial_trust_region_radius=_FAR if wide else _NEAR,
         )
-        posed = frozen(problem, bent=bent)
+        posed = frozen(problem, bent=bent and self.bends)
         adjustment = adjust(posed, quick, on_progress=named(self.watch, stage))
         finite = np.isfinite(adjustment.state.distance).all() and np.isfinite(adjustment.points).all()
         if adjustment.termination == "failure" or not finite:
@@ -290,7 +290,7 @@ def solve_soft(
 
 
 def _find_waves(solver: _Solver) -> Round:
-    """The statistics that make the data most probable, at a solution with them: swell or ripples first, then finer."""
+    """The statistics that make the data most probable, at a solution: swell or ripples first, then how long."""
     tried: list[tuple[float, Round]] = []
     failed: Unsupported | None = None
     (swell, *shorter), level = _first_guesses(solver)
@@ -310,9 +310,9 @@ def _find_waves(solver: _Solver) -> Round:
         raise failed
     found = tried[-1][1]
     # Planes that move freely take up what little is known of such waves, and run away.
-    sought = not solver.options.knows_wavelength and not solver.bends
-    if sought and not solver.resolves(found.statistics) and _is_solution(found):
-        tried += _chop(solver, found, level)
+    if not solver.bends and not solver.options.knows_wavelength and not solver.resolves(found.statistics):
+        if _is_solution(found):
+            tried += _chop(solver, found, level)
     best, found = max(tried, key=lambda one: (_is_solution(one[1]), one[0]))
     if not solver.options.knows_wavelength and solver.resolves(found.statistics):
         for factor in _SCALES:
@@ -401,7 +401,7 @@ def _settled(
     """Solve until the points stay: statistics of a solution that is far from its minimum would lead it astray."""
 
     def solve(current: Problem | None, number: int, bent: bool) -> Round:
-        return _solve_once(solver, current, statistics, level, wide=number < num_wide, bent=bent and solver.bends)
+        return _solve_once(solver, current, statistics, level, wide=number < num_wide, bent=bent)
 
     return _repeated(solve, current, most, _SETTLED)
 
@@ -500,13 +500,10 @@ def _last_solves(
     def at_planes(current: Problem | None, number: int, _: bool) -> Round:
         return solve(current, number, False)
 
-    if not solver.bends:
-        found = _repeated(at_planes, current, _MOST_LAST, _CLOSE)
-    else:
-        found = _repeated(solve, current, _MOST_LAST, _CLOSE)
-        if solver.resolves(statistics):
-            flat = _repeated(at_planes, found.wavy.problem, _MOST_LAST, _CLOSE)
-            found = max(found, flat, key=lambda one: (one.moved <= _UNSETTLED, _evidence(solver, one)))
+    found = _repeated(solve, current, _MOST_LAST, _CLOSE)
+    if solver.bends and solver.resolves(statistics):
+        flat = _repeated(at_planes, found.wavy.problem, _MOST_LAST, _CLOSE)
+        found = max(found, flat, key=lambda one: (one.moved <= _UNSETTLED, _evidence(solver, one)))
     if found.moved > _UNSETTLED:
         raise Unsupported("Waves are not determined: solutions with them do not settle")
     return SoftSolution(
