@@ -310,9 +310,9 @@ def _find_waves(solver: _Solver) -> Round:
         raise failed
     found = tried[-1][1]
     # Planes that move freely take up what little is known of such waves, and run away.
-    if not solver.bends and not solver.options.knows_wavelength and not solver.resolves(found.statistics):
-        if _is_solution(found):
-            tried += _chop(solver, found, level)
+    sought = not solver.bends and not solver.options.knows_wavelength
+    if sought and not solver.resolves(found.statistics) and _is_solution(found):
+        tried += _chop(solver, found, level)
     best, found = max(tried, key=lambda one: (_is_solution(one[1]), one[0]))
     if not solver.options.knows_wavelength and solver.resolves(found.statistics):
         for factor in _SCALES:
