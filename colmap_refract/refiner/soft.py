@@ -40,7 +40,7 @@ tilts of its plane. A swell that is thought to be steeper than it is is found; o
 What is left of a smooth surface is noise rather than slopes."""
 _CHOP = (0.4, 0.2)
 """Wavelengths over the same width of what is between the two, and sought from a solution with ripples."""
-_SCALES = (0.5, 1.4)
+_SCALES = (1.4, 0.5)
 """By which the wavelength of a swell is changed while the data become more probable."""
 _FIRST_SLOPE_AT_REST = np.tan(np.radians(2.0))
 """For cameras whose poses are held: there the waves alone tell the depth of the water."""
@@ -68,8 +68,8 @@ _MOST_LAST, _CLOSE, _UNSETTLED = 8, 0.1, 2.0
 """Last solves, at most; noise deviations by which predicted keypoints move between two of them in the end, and by which
 they may not. With a slope of 4 degrees it took 3 to 8."""
 _LOOSER = 5.0
-"""How much wider the level prior is where waves are not resolved, and stays. What is known of the planes is worth a few
-per cent there, but draws the interface towards where the planes need to scatter less."""
+"""How much wider the level prior is where waves are not resolved, and in the last solves. What is known of the planes
+is worth a few per cent, but draws the interface towards where the planes need to scatter less."""
 _FAR_OFF = 10.0
 """Noise deviations; a point that moves by more counts as if it moved by so much."""
 _SHORTEST_STEP = 0.2
@@ -118,7 +118,7 @@ class Round:
         wavy: at the solution.
         solved: what was solved, at its solution: the waves' effects as they stood.
         adjustment: the solver's word.
-        statistics, level: the priors that it was solved with.
+        statistics, level: what is known of waves and planes; the level prior of `solved` can be looser.
         moved: noise deviations by which keypoints moved from the solution that the design is of.
     """
 
@@ -136,7 +136,7 @@ class SoftSolution:
 
     Attributes:
         wavy: the observations that were solved with, at the solution.
-        statistics, level: the priors in the end.
+        statistics, level: of waves and planes, in the end.
         adjustment: the last.
         solved: what it solved, at its solution: the waves' effects as they stood.
     """
@@ -216,8 +216,12 @@ class _Solver:
         stage: str,
         wide: bool = False,
         bent: bool = False,
+        last: bool = False,
     ) -> Round:
-        """One round: the design at the current solution, and a solve; `bent` as for `frozen`, where that settles."""
+        """One round: the design at the current solution, and a solve; `bent` as for `frozen`, where that settles.
+
+        While a solution is sought, and `last` is not, the level prior keeps the planes of a swell together.
+        """
         if self.options.wavelength_in_depths is not None:
             length = self.options.wavelength_in_depths / _distance_in_depths(self.flat if current is None else current)
             statistics = replace(statistics, wavelength=length)
@@ -228,7 +232,9 @@ class _Solver:
         if wide:
             # Before waves are known, all residuals are large; wrong matches are larger.
             scale = max(scale, _WIDE * float(np.median(np.abs(residuals(wavy.problem)))))
-        problem = replace(wavy.problem, level_prior=level, loss="cauchy", loss_scale=scale)
+        looser = last or not self.resolves(statistics)
+        prior = self._looser(level) if looser and level is not None else level
+        problem = replace(wavy.problem, level_prior=prior, loss="cauchy", loss_scale=scale)
         quick = replace(
             self.settings,
             max_num_iterations=min(self.settings.max_num_iterations, _MOST_ITERATIONS),
@@ -252,6 +258,14 @@ class _Solver:
     def resolves(self, statistics: WaveStatistics) -> bool:
         """Whether modes say anything of waves that long."""
         return statistics.wavelength >= _SHORTEST_RESOLVED * self.width
+
+    def _looser(self, level: LevelPrior) -> LevelPrior:
+        """A wider level prior, but for what the user said."""
+        return replace(
+            level,
+            tilt=level.tilt * (1.0 if self.options.tilt is not None else _LOOSER),
+            lift=level.lift * (1.0 if self.options.lift is not None else _LOOSER),
+        )
 
 
 def solve_soft(
@@ -295,11 +309,15 @@ def _find_waves(solver: _Solver) -> Round:
     failed: Unsupported | None = None
     (swell, *shorter), level = _first_guesses(solver)
     starts = [(swell, first_modes) for first_modes in _FIRST_MODES] + [(statistics, ()) for statistics in shorter]
+    firsts: list[Round] = []
     for statistics, first_modes in starts:
         if statistics is not swell and any(_is_explained(found) for _, found in tried):
             continue
         try:
-            first = _first_solution(solver, statistics, _looser(solver, statistics, level), first_modes)
+            first = _first_solution(solver, statistics, level, first_modes)
+            if statistics is swell and any(_is_the_same(first, other) for other in firsts):
+                continue
+            firsts.append(first)
             found = _with_statistics(solver, first)
         except Unsupported as unsupported:
             failed = unsupported
@@ -336,18 +354,6 @@ def _chop(solver: _Solver, ripples: Round, level: LevelPrior | None) -> list[tup
             continue
         tried.append((_evidence(solver, found), found))
     return tried
-
-
-def _looser(solver: _Solver, statistics: WaveStatistics, level: LevelPrior | None) -> LevelPrior | None:
-    """The level prior for waves of some length."""
-    if level is None or solver.resolves(statistics):
-        return level
-    given = solver.options
-    return replace(
-        level,
-        tilt=level.tilt * (1.0 if given.tilt is not None else _LOOSER),
-        lift=level.lift * (1.0 if given.lift is not None else _LOOSER),
-    )
 
 
 def _rescaled(solver: _Solver, found: Round, evidence: float, factor: float) -> Round:
@@ -444,6 +450,12 @@ def _is_solution(found: Round) -> bool:
     return found.moved <= _UNSETTLED and is_sound(found.wavy.problem)
 
 
+def _is_the_same(one: Round, other: Round) -> bool:
+    """Whether two settled solutions with the same statistics are one, but for how well they settled."""
+    settled = max(one.moved, other.moved) < _SETTLED
+    return settled and _change(one.wavy.problem, other.wavy.problem) < 2.0 * _SETTLED
+
+
 def _is_explained(found: Round) -> bool:
     """Whether a swell leaves nothing for shorter waves."""
     return _is_solution(found) and float(np.median(np.abs(raw_residuals(found.wavy, found.solved)))) < _EXPLAINED
@@ -494,7 +506,7 @@ def _last_solves(
     def solve(current: Problem | None, number: int, bent: bool) -> Round:
         return solver.solve(
             current, statistics, level, solver.options.num_modes, stage=f"Waves, solve {number + 1}",
-            wide=number == 0, bent=bent,
+            wide=number == 0, bent=bent, last=True,
         )  # fmt: skip
 
     def at_planes(current: Problem | None, number: int, _: bool) -> Round:
@@ -512,7 +524,12 @@ def _last_solves(
 
 
 def go_on(
-    start: Problem, keep: NDArray[np.bool_], soft: SoftSolution, settings: SolverSettings, watch: Watch | None
+    start: Problem,
+    keep: NDArray[np.bool_],
+    soft: SoftSolution,
+    options: WaveOptions,
+    settings: SolverSettings,
+    watch: Watch | None,
 ) -> SoftSolution:
     """The last solve again, with fewer observations.
 
@@ -520,12 +537,8 @@ def go_on(
         start: of all N observations, without waves.
         keep: (N,) those that take part now.
         soft: the solution so far, with all of them.
-        settings, watch: as for `solve_soft`.
+        options, settings, watch: as for `solve_soft`.
     """
-    options = WaveOptions(
-        slope_deviation=None, wavelength=None, wavelength_in_depths=None, level_prior=soft.level is not None, tilt=None,
-        lift=None, num_modes=soft.wavy.problem.num_waves,
-    )  # fmt: skip
     solver = _Solver(_part(start, keep), options, settings, watch)
     return _last_solves(solver, _part(soft.wavy.problem, keep), soft.statistics, soft.level)
 

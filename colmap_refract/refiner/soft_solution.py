@@ -87,14 +87,15 @@ def _solve_soft(
     """Start on level water, solve with waves, filter and solve again."""
     begin = wavy_start(arrangement, settings, earlier, watch)
     keep = np.ones(len(begin.tracks.image), dtype=np.bool_)
-    soft = solve_soft(arrangement, begin, keep, wave_options(arrangement), settings, watch)
+    options = wave_options(arrangement)
+    soft = solve_soft(arrangement, begin, keep, options, settings, watch)
     marks = filter_waves(arrangement, soft.wavy.problem, soft.statistics.noise)
     counts = np.add.reduceat(marks.keep.astype(np.int64), begin.tracks.start[:-1])
     keep = marks.keep & np.repeat(counts >= 2, np.diff(begin.tracks.start))
     if keep.mean() < _LEAST_KEPT:
         raise Unsupported("Waves are not determined: with them most observations are far off")
     if not keep.all():
-        soft = go_on(begin, keep, soft, settings, watch)
+        soft = go_on(begin, keep, soft, options, settings, watch)
     problem = soft.wavy.problem
     if not is_sound(problem):
         raise Unsupported("Waves are not determined: with them the interface runs away from between cameras and points")
