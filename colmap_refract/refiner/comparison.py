@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from colmap_refract.estimator.adjustment import Progress
 
-HELD_OUT_PART = 0.1
+HELD_OUT_PART = 0.2
 OBSERVATIONS_PER_IMAGE = 300
 """A decision takes far fewer than a solution does. With half of them, planes that move by little pass for one."""
 _TOLERANCE = 1e-6
@@ -39,7 +39,7 @@ _MEDIAN_LENGTH = 1.1774
 """Of a plane vector with coordinates of unit standard deviation."""
 _CONFIDENCE = 0.975
 """One-sided, of the interval of a difference: 95 % two-sided."""
-_RELEVANT = 0.01
+_RELEVANT = 0.005
 """Part of the error: what is better by less is not worth more unknowns."""
 
 
@@ -126,7 +126,7 @@ def compare(
     """Refine a model in several ways without some of its observations, and see which way predicts those best.
 
     A candidate is tied with the best one while noise explains the difference of their mean squared errors (95 %
-    confidence, the images as clusters), or the roots differ by less than a hundredth. Of the best and those tied
+    confidence, the images as clusters), or the roots differ by less than half a hundredth. Of the best and those tied
     with it the simplest is chosen; among equally simple ones the better. A single candidate is chosen untried.
 
     Args:

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 _LEAST_TRACK = 3
 """Observations of a point from which one is held out: two others still tell where it is."""
+_MOST_OF_TRACK = 0.2
+"""Part of a point's observations that may be held out, if that is more than one."""
 _MOST_OF_IMAGE = 0.2
 """Part of an image's observations that may be held out."""
 _LEAST_KEPT = 20
@@ -38,7 +40,7 @@ class HeldOut:
 
     Attributes:
         reconstruction: the model that is left; images, keypoints and names are all there.
-        observations: the K that were held out, of K points: one of each.
+        observations: the K that were held out, each under a point of its own: ids of points may be there twice.
     """
 
     reconstruction: pycolmap.Reconstruction
@@ -72,7 +74,7 @@ def hold_out(
 ) -> HeldOut:
     """Choose observations at random and take them out of a copy of the model.
 
-    At most one of each point, and only of points with three or more; spread over the images, of which none loses
+    Of points with three or more, and of each one or a fifth at most; spread over the images, of which none loses
     more than a fifth of what it has, nor any that would be left with fewer than 20.
 
     Args:
@@ -140,17 +142,20 @@ def _choose(observations: Observations, part: float, rng: np.random.Generator) -
     room = np.clip(np.minimum(np.floor(_MOST_OF_IMAGE * counts), counts - _LEAST_KEPT), 0, None).astype(int)
     taken = np.zeros(len(counts), dtype=np.int64)
     target = max(1, round(part * len(observations.image)))
-    chosen: list[int] = []
-    for p in rng.permutation(len(observations.points)).tolist():
+    chosen: set[int] = set()
+    lengths = np.diff(observations.start)
+    most = np.where(lengths < _LEAST_TRACK, 0, np.maximum(1, np.floor(_MOST_OF_TRACK * lengths))).astype(int)
+    # One of every point, then a second of those that have it to spare: few of many points say more than many of few.
+    order = rng.permutation(len(lengths))
+    for p in [p for turn in range(int(most.max(initial=0))) for p in order[most[order] > turn].tolist()]:
         first, last = observations.start[p], observations.start[p + 1]
-        if last - first < _LEAST_TRACK:
-            continue
         image = observations.image[first:last]
         # The image that has lost the least so far; a choice at random would leave some with hardly any.
         share = np.where(taken[image] < room[image], (taken[image] + rng.random(len(image))) / counts[image], np.inf)
+        share[[k for k in range(len(image)) if first + k in chosen]] = np.inf
         k = int(share.argmin())
         if np.isfinite(share[k]):
-            chosen.append(int(first) + k)
+            chosen.add(int(first) + k)
             taken[image[k]] += 1
         if len(chosen) == target:
             break
@@ -158,7 +163,7 @@ def _choose(observations: Observations, part: float, rng: np.random.Generator) -
 
 
 def _single(observations: Observations, chosen: NDArray[np.int64]) -> Observations:
-    """The observations at `chosen`, each of another point, and those points."""
+    """The observations at `chosen`, and their points, once for each."""
     point = observations.point[chosen]
     return replace(
         observations,
