@@ -225,6 +225,9 @@ class _Solver:
         if self.options.wavelength_in_depths is not None:
             length = self.options.wavelength_in_depths / _distance_in_depths(self.flat if current is None else current)
             statistics = replace(statistics, wavelength=length)
+        _, distance = (self.flat if current is None else current).state.planes_in_cam(self.flat.structure)
+        if not (distance[self.flat.structure.image_plane >= 0] > 0).all():
+            raise Unsupported("Waves are not determined: with them the interface runs into the cameras")
         if not self.resolves(statistics):
             num_modes = 0
         wavy = with_waves(self.flat, statistics, num_modes, current, counted(self.watch, f"{stage}, surfaces"))
