@@ -365,9 +365,12 @@ def _rescaled(solver: _Solver, found: Round, evidence: float, factor: float) -> 
         statistics = replace(found.statistics, wavelength=factor * found.statistics.wavelength)
         try:
             other = _solve_once(solver, found.wavy.problem, statistics, found.level)
+            if _evidence(solver, other) <= evidence:
+                break
+            other = _settled(solver, other.wavy.problem, statistics, found.level, _MOST_BETWEEN)
         except Unsupported:
             break
-        if (rescaled := _evidence(solver, other)) <= evidence:
+        if not _is_solution(other) or (rescaled := _evidence(solver, other)) <= evidence:
             break
         evidence, found = rescaled, other
     return found
@@ -465,7 +468,8 @@ def _is_explained(found: Round) -> bool:
 
 
 def _with_statistics(solver: _Solver, found: Round) -> Round:
-    """Say anew how steep the waves are, and solve again, until that stays."""
+    """Say anew how steep the waves are, and solve again, until that stays; the last that settled, if any does."""
+    settled = found
     for _ in range(_NUM_UPDATES):
         if found.moved > _HOPELESS:
             # Of no solution are there statistics.
@@ -474,9 +478,12 @@ def _with_statistics(solver: _Solver, found: Round) -> Round:
         counted(solver.watch, "Wave statistics, update")(0, 1)
         statistics, level = _updated(solver, found)
         found = _settled(solver, found.wavy.problem, statistics, level, _MOST_BETWEEN)
+        if found.moved <= _UNSETTLED:
+            settled = found
         if abs(np.log(statistics.slope_deviation / before.slope_deviation)) < _STAYS:
             break
-    return found
+    # With less noise a surface is steeper, and solutions may come to no end.
+    return settled if settled.moved <= _UNSETTLED else found
 
 
 def _shows_waves(solver: _Solver, found: Round) -> bool:
