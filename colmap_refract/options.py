@@ -15,6 +15,7 @@ Scenario = Literal["moving_interface", "static_interface", "fixed_camera", "came
 ScenarioOrAuto = Literal["auto", "moving_interface", "static_interface", "fixed_camera", "camera_housing"]
 InterfaceShape = Literal["plane", "soft", "soft_as_printed", "auto"]
 Residual = Literal["pixels", "scene"]
+WaveNodes = Literal["height", "slopes"]
 Loss = Literal["trivial", "huber", "soft_l1", "cauchy"]
 
 _STEEPEST_DEG, _MOST_WAVE_MODES = 17.0, 200
@@ -137,6 +138,9 @@ class RefinerRequest:
     num_wave_modes: int = 36
     """Unknowns of each image's surface, with soft: its most probable shapes.
     What they cannot take counts as noise."""
+    wave_nodes: WaveNodes = "height"
+    """What nodes over each image hold, with soft. height: a surface, whose slopes belong together; slopes:
+    two free slopes and no height, as the paper's normals. What is written is a surface, the closest one."""
     level_prior: bool = True
     """Water is level on average: with soft, the planes of a moving interface scatter about one."""
     level_tilt_deg: float | None = None
@@ -208,6 +212,10 @@ class RefinerRequest:
                 f"num_wave_modes {self.num_wave_modes}: give 4 to {_MOST_WAVE_MODES}; the default is enough for a "
                 "surface that is smooth over the view"
             )
+        if self.wave_nodes not in get_args(WaveNodes):
+            raise RefractError(f"wave_nodes '{self.wave_nodes}': give {' or '.join(get_args(WaveNodes))}")
+        if self.wave_nodes == "slopes" and self.interface_shape not in ("soft", "auto"):
+            raise RefractError("wave_nodes slopes belongs to interface_shape soft: choose that, or leave it out")
         self._check_reference()
         for name in ("level_tilt_deg", "level_lift"):
             value = getattr(self, name)

@@ -124,6 +124,20 @@ def test_swell(solved: Solved, scenario: Scenario) -> None:
     assert soft.reconstruction.num_points3D() == scene.model.num_points3D()
 
 
+def test_free_slopes(solved: Solved) -> None:
+    """Slopes that need not be a surface's: better than none, and no better than a surface, which knows more."""
+    scene, soft = solved("moving_interface", "soft")
+    free = scene.refine(**SOFT, wave_nodes="slopes")
+    found, surface = (point_rmse(result.reconstruction, scene.capture) for result in (free, soft))
+    assert found < 0.5 * point_rmse(scene.model, scene.capture)
+    assert free.converged and abs(found - surface) > 1e-3 * surface
+    assert surface < 1.1 * found
+    # What is written is a surface, and nearer to the true one than a plane: by a half.
+    assert all(entry.surface is not None for entry in free.sidecar.images.values())
+    still = shape_error(keypoint_normals(scene, free.sidecar, with_surface=False), scene)
+    assert shape_error(keypoint_normals(scene, free.sidecar), scene) < 0.7 * still
+
+
 def test_planes_do_not_explain_swell(solved: Solved) -> None:
     ignored, flat, wavy = solved.errors("static_interface")
     # Factors of 1.7 and 4.5 here, of 2 to 10 in other draws: what remains is near what the data allow.
@@ -383,6 +397,8 @@ def test_diagnosis_of_a_housing(scenes: Scenes) -> None:
         ({"wavelength": np.inf}, "wavelength"),
         ({"num_wave_modes": 1}, "num_wave_modes"),
         ({"num_wave_modes": 10_000}, "num_wave_modes"),
+        ({"wave_nodes": "normals"}, "wave_nodes"),
+        ({"wave_nodes": "slopes", "interface_shape": "plane"}, "wave_nodes"),
         ({"level_lift": 0.0}, "level_lift"),
         ({"level_tilt_deg": -1.0}, "level_tilt_deg"),
     ],

@@ -51,7 +51,7 @@ from colmap_refract.estimator.priors import (
     plane_stands,
     prior_blocks,
 )
-from colmap_refract.estimator.random_surface import RandomSurface, modes, node_grid
+from colmap_refract.estimator.random_surface import RandomSlopes, RandomSurface, closest_surface, modes, node_grid
 from colmap_refract.estimator.rotation import exp_and_left_jacobian
 from colmap_refract.estimator.scenario import SCENARIOS, Change, State, Structure, apply, evaluate_views
 from colmap_refract.estimator.surface import local_planes
@@ -519,6 +519,47 @@ def test_the_covariance_is_that_of_sinusoids(wavelength: float) -> None:
             # Within five standard deviations of the mean, of which a million draws leave 0.1 % of the variance.
             assert np.mean(each) == pytest.approx(value, abs=5 * np.std(each) / np.sqrt(len(each)))
         assert found[2] == pytest.approx(0, abs=1e-15)
+
+
+@pytest.mark.parametrize("apart", [[0.0, 0.0], [0.3, 0.1], [0.0, 0.7], [2.0, -1.0]])
+def test_free_slopes_are_those_of_a_surface_but_for_direction(apart: list[float]) -> None:
+    """The covariance of one slope is half the trace of a surface's, here by finite differences of its heights."""
+    surface, free = (kind(slope_deviation=0.05, wavelength=0.8) for kind in (RandomSurface, RandomSlopes))
+    places = np.array([[0.1, 0.2], np.add([0.1, 0.2], apart)])
+    slopes = joint_covariance(surface, places).reshape(3, 2, 3, 2)[1:, 0, 1:, 1]
+    found = free.covariance(places[:1], places[1:])[0]
+    assert not found[0].any() and found[1, 1] == found[2, 0] == 0.0
+    for axis in range(2):
+        assert found[1 + axis, axis] == pytest.approx(0.5 * np.trace(slopes), rel=1e-4, abs=1e-8)
+    between = free.between_nodes(places)
+    np.testing.assert_allclose(between, between.T, atol=1e-18)
+    assert between[0, 1] == pytest.approx(found[1, 0]) and between[0, 0] == pytest.approx(SLOPE_VARIANCE, rel=1e-4)
+
+
+def test_the_closest_surface_is_the_one_that_slopes_belong_to() -> None:
+    """Slopes of a drawn surface come back, with its heights but for a constant; of slopes of no surface not all do."""
+    field = RandomSlopes(slope_deviation=0.05, wavelength=0.8)
+    nodes = node_grid(places_of("wide"), 0.8)
+    free, rng = modes(field, nodes, 2 * len(nodes)), np.random.default_rng(8)
+    drawn = modes(SURFACE, nodes, 12)
+    true = rng.normal(size=12)
+    slopes = (drawn.at(nodes)[:, 1:] @ true).T.ravel()
+    at, by = closest_surface(free, free.weights.T @ slopes)
+    error = at.at(nodes) @ by - drawn.at(nodes) @ true
+    assert np.sqrt(np.mean(error[:, 1:] ** 2)) < 0.02 * np.sqrt(np.mean(slopes**2))
+    assert np.std(error[:, 0]) < 0.02 * np.std(drawn.at(nodes)[:, 0] @ true)
+    none = rng.normal(size=free.shapes.shape[1])
+    at, by = closest_surface(free, none)
+    left = (at.at(nodes) @ by - free.at(nodes) @ none)[:, 1:]
+    assert np.sqrt(np.mean(left**2)) > 0.3 * np.sqrt(np.mean((free.at(nodes) @ none) ** 2))
+
+
+def test_modes_of_free_slopes_have_no_height_and_no_more_than_there_is() -> None:
+    field = RandomSlopes(slope_deviation=0.05, wavelength=0.8)
+    design = modes(field, node_grid(places_of("wide"), 0.8), 10_000).at(places_of("wide"))
+    explained = np.sum(design**2, axis=2) / SLOPE_VARIANCE
+    assert not explained[:, 0].any()
+    assert (explained[:, 1:] <= 1 + 1e-3).all() and (explained[:, 1:] >= 1 - 5e-3).all()
 
 
 def test_drawn_surfaces_are_as_steep_as_asked() -> None:

@@ -94,6 +94,7 @@ class WaveOptions:
         wavelength_in_depths: over the median depth: a model's size is known by its depth, not by its interface.
         level_prior: whether there is one.
         num_modes: per image.
+        free_slopes: as of `WaveStatistics`.
     """
 
     slope_deviation: float | None
@@ -103,6 +104,7 @@ class WaveOptions:
     tilt: float | None
     lift: float | None
     num_modes: int
+    free_slopes: bool
 
     @property
     def knows_wavelength(self) -> bool:
@@ -188,6 +190,7 @@ def wave_options(arrangement: Arrangement) -> WaveOptions:
         tilt=None if tilt is None else float(np.radians(tilt)),
         lift=options.level_lift,
         num_modes=options.num_wave_modes,
+        free_slopes=options.wave_nodes == "slopes",
     )
 
 
@@ -600,7 +603,10 @@ def _first_guesses(solver: _Solver) -> tuple[list[WaveStatistics], LevelPrior | 
         tilt = options.tilt if options.tilt is not None else float(_FIRST_TILT)
         lift = options.lift if options.lift is not None else _FIRST_LIFT
         level = LevelPrior(tilt=tilt, lift=lift, noise=_FIRST_WAVES[0].noise)
-    waves = [replace(statistics, wavelength=statistics.wavelength * solver.width) for statistics in _FIRST_WAVES]
+    waves = [
+        replace(statistics, wavelength=statistics.wavelength * solver.width, free_slopes=options.free_slopes)
+        for statistics in _FIRST_WAVES
+    ]
     if options.knows_wavelength:
         # In depths it is put into distances at each solve.
         waves = [waves[0] if options.wavelength is None else replace(waves[0], wavelength=options.wavelength)]

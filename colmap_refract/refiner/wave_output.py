@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from colmap_refract.estimator.random_surface import Modes
+from colmap_refract.estimator.random_surface import Modes, closest_surface
 from colmap_refract.files.sidecar import Sidecar
 from colmap_refract.interface import Array
 from colmap_refract.refiner.arrangement import Arrangement
@@ -39,6 +39,8 @@ def add_waves(
             continue
         mine = tracks.image == i
         coefficients = problem.state.waves[i, : shapes.shapes.shape[1]]
+        if statistics.free_slopes:
+            shapes, coefficients = closest_surface(shapes, coefficients)
 
         def heights(at: Array, shapes: Modes = shapes, coefficients: Array = coefficients) -> Array:
             return np.asarray(shapes.at(at)[:, 0] @ coefficients)

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from colmap_refract.estimator import elimination
 from colmap_refract.estimator.adjustment import SolverSettings, settle_points
 from colmap_refract.estimator.chunk import Problem
-from colmap_refract.estimator.random_surface import Modes, RandomSurface, modes, node_grid
+from colmap_refract.estimator.random_surface import Modes, RandomSlopes, RandomSurface, modes, node_grid
 from colmap_refract.estimator.robust import LOSSES, weights
 from colmap_refract.estimator.surface import local_planes
 from colmap_refract.interface import Array, tangent_basis
@@ -48,12 +48,14 @@ class WaveStatistics:
         wavelength: the dominant one, over the median distance of the interfaces.
         noise: of a keypoint coordinate, px.
         unresolved: variance of the slopes that the modes cannot take, over what the spectrum has there.
+        free_slopes: whether slopes are free, in place of those of a surface.
     """
 
     slope_deviation: float
     wavelength: float
     noise: float
     unresolved: float = 1.0
+    free_slopes: bool = False
 
     def total_slope(self, explained: float) -> float:
         """Slope deviation of all waves, where the modes can take a part of the variance that the spectrum has."""
@@ -113,13 +115,14 @@ def with_waves(
     waves = np.zeros((len(tracks.image), 3, num_modes))
     coefficients = np.zeros((structure.num_images, num_modes))
     tolerance = _FIT * statistics.slope_deviation
+    field = RandomSlopes if statistics.free_slopes else RandomSurface
     for image in np.flatnonzero(refracted).tolist():
         on_image(image, structure.num_images)
         mine = np.flatnonzero((tracks.image == image) & np.isfinite(places).all(axis=1))
         if not len(mine) or not resolved:
             continue
         length = statistics.wavelength * typical / distance[image]
-        surface = RandomSurface(slope_deviation=statistics.slope_deviation, wavelength=length)
+        surface = field(slope_deviation=statistics.slope_deviation, wavelength=length)
         shapes = modes(surface, node_grid(places[mine], length), num_modes)
         by_image[image] = shapes
         # The normal leans against the slope.
