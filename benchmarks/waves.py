@@ -430,6 +430,11 @@ def small_intro() -> str:
     return PRINTED.format(images=PRINTED_IMAGES, points=PRINTED_POINTS, radius=RADIUS, iterations=PRINTED_ITERATIONS)
 
 
+def introduction(seeds: int, *, small: bool, first: bool) -> str:
+    """Of a section; what the columns are is said in the first."""
+    return "\n\n".join(([intro(seeds)] if first else []) + ([small_intro()] if small else []))
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=5, metavar="N", help="scenes per row (5); 0: no rows")
@@ -440,7 +445,9 @@ def main() -> int:
         metavar="ROW",
         help="rows whose name has this in it: moving_interface/swell/2",
     )
-    parser.add_argument("--printed", type=int, choices=(0, 1), default=0, help="also the paper's own terms: slow (0)")
+    parser.add_argument(
+        "--printed", choices=("0", "1", "only"), default="0", help="also the paper's own terms, or only those: slow (0)"
+    )
     parser.add_argument("--given", type=int, choices=(0, 1), default=0, help="also soft with the true slope given (0)")
     parser.add_argument("--time", type=int, choices=(0, 1), default=1, help="hard against soft, 1000 points (1)")
     parser.add_argument("--large", type=int, choices=(0, 1), default=0, help="also 200 images of 2000 keypoints (0)")
@@ -453,7 +460,7 @@ def main() -> int:
         parser.error(f"--only {' '.join(arguments.only)}: no row of that name; there is {next(all_rows()).name}")
     if arguments.seeds == 0:
         rows = []
-    sizes = [False, True] if arguments.printed else [False]
+    sizes = {"0": [False], "1": [False, True], "only": [True]}[arguments.printed]
     num_rows = {printed: sum(row.slope_deg > 0 or not printed for row in rows) for printed in sizes}
     line = ProgressLine(sum(num_rows.values()) * arguments.seeds + len(SCENARIOS) * arguments.time + arguments.large)
     # The first refinement of a process waits for the compiler.
@@ -473,7 +480,7 @@ def main() -> int:
                 measure(draws, seed, printed=printed, given=bool(arguments.given))
             done[printed].append(draws)
             sections = [
-                f"{small_intro() if small else intro(arguments.seeds)}\n\n"
+                f"{introduction(arguments.seeds, small=small, first=small == sizes[0])}\n\n"
                 f"{accuracy_tables(part, printed=small, given=bool(arguments.given))}"
                 for small, part in done.items()
                 if part
@@ -481,7 +488,7 @@ def main() -> int:
             progress = f"{sum(map(len, done.values()))} of {sum(num_rows.values())} rows so far."
             parts = [f"# {TITLE}", f"    {command()}", environment(), progress, *sections]
             arguments.output_path.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
-    missed = misses(done[False])
+    missed = misses(done.get(False, []))
     if arguments.time:
         sections.append(time_section(line))
     if arguments.large:

@@ -294,6 +294,29 @@ def test_the_simplest_of_equals_wins() -> None:
     assert single.chosen.label == "simple"
 
 
+def test_of_waves_that_predict_alike_the_likelihood_decides() -> None:
+    """An unknown more is worth one unit; what was not tied before, or has no likelihood, has no part in it."""
+    rng = np.random.default_rng(0)
+    image = np.repeat(np.arange(10), 20)
+    error = np.linalg.norm(rng.standard_normal((200, 2)), axis=1)
+
+    def chosen(simple: float | None, free: float | None, off: float = 0.0) -> tuple[str, str]:
+        trials = [
+            Trial(candidate=Candidate(label=label, options=STATIC, complexity=complexity), log_likelihood=likelihood)
+            for label, complexity, likelihood in (("simple", 3, simple), ("free", 9, free), ("flat", 1, None))
+        ]
+        errors = [error, np.hypot(error, off), np.hypot(error, 2.0)]
+        candidate, why = comparison._choose(comparison._judge(trials, errors, image))
+        return candidate.label, why
+
+    label, why = chosen(100.0, 110.0)
+    assert label == "free" and "higher by 10, for 6 more unknowns" in why
+    label, why = chosen(100.0, 105.0)
+    assert label == "simple" and "as well as free" in why
+    assert chosen(100.0, 200.0, off=1.0)[0] == "simple"
+    assert chosen(None, 200.0)[0] == chosen(100.0, None)[0] == "simple"
+
+
 def test_wrong_matches_and_lost_points_do_not_decide() -> None:
     rng = np.random.default_rng(0)
     image = np.repeat(np.arange(10), 20)

@@ -50,7 +50,7 @@ class Candidate:
     Attributes:
         label: what to call it.
         options: of the refinement.
-        complexity: unknowns of interfaces and poses, or another number of which the least is the simplest.
+        complexity: unknowns of interfaces and poses, of which the least is the simplest.
     """
 
     label: str
@@ -68,6 +68,7 @@ class Trial:
         difference: of `error` to the best candidate's; 0 for that one.
         difference_std: standard error of `difference`.
         tied: whether the difference is no larger than noise explains, or too small to matter.
+        log_likelihood: of what was not held out, averaged over the waves, where there are some.
         seconds: of the refinement.
         reason: why it could not be refined; empty if it could.
     """
@@ -77,6 +78,7 @@ class Trial:
     difference: float | None = None
     difference_std: float | None = None
     tied: bool = False
+    log_likelihood: float | None = None
     seconds: float = 0.0
     reason: str = ""
 
@@ -128,6 +130,10 @@ def compare(
     A candidate is tied with the best one while noise explains the difference of their mean squared errors (95 %
     confidence, the images as clusters), or the roots differ by less than half a hundredth. Of the best and those tied
     with it the simplest is chosen; among equally simple ones the better. A single candidate is chosen untried.
+
+    Between shapes that wave, prediction says little of what moves: a surface follows what the planes do, if it may be
+    steep enough. Where such a shape is the simplest, the likelihood of what was seen decides between it and those
+    tied with it that wave, too: an unknown more is worth one unit of its logarithm (Akaike 1974).
 
     Args:
         reconstruction: a COLMAP model that ignored refraction; not altered.
@@ -232,16 +238,18 @@ def _try(
             watch(f"{name}: {stage}", progress)
 
     started = perf_counter()
-    reason, error = "", np.full(len(held_out.observations.image), np.inf)
+    reason, error, likelihood = "", np.full(len(held_out.observations.image), np.inf), None
     try:
         options = replace(candidate.options, BundleAdjustment=quick)
         refined = refine(held_out.reconstruction, options, notes=notes, cameras=cameras, watch=show)
         error = held_out.errors(refined.reconstruction, refined.sidecar)
+        likelihood = refined.sidecar.statistics.get("waves", {}).get("log_likelihood")
         if not np.isfinite(np.median(error)):
             reason = "it lost most of the points"
     except RefractError as problem:
         reason = str(problem)
-    return Trial(candidate=candidate, seconds=perf_counter() - started, reason=reason), error
+    seconds = perf_counter() - started
+    return Trial(candidate=candidate, log_likelihood=likelihood, seconds=seconds, reason=reason), error
 
 
 def _judge(trials: list[Trial], errors: list[Array], image: Index) -> list[Trial]:
@@ -273,12 +281,24 @@ def _judge(trials: list[Trial], errors: list[Array], image: Index) -> list[Trial
     return judged
 
 
+def _gain(trial: Trial, simplest: Trial) -> float:
+    """By what the log likelihood is higher than the simplest candidate's, less one for each unknown more."""
+    more = trial.candidate.complexity - simplest.candidate.complexity
+    if trial is simplest:
+        return 0.0
+    if trial.log_likelihood is None or simplest.log_likelihood is None or more <= 0:
+        return -np.inf
+    return trial.log_likelihood - simplest.log_likelihood - more
+
+
 def _choose(trials: Sequence[Trial]) -> tuple[Candidate, str]:
     """The simplest of the best and those tied with it, and why."""
     tied = sorted(
         (trial for trial in trials if trial.tied), key=lambda trial: (trial.candidate.complexity, trial.error)
     )
-    winner, others = tied[0], tied[1:]
+    simplest = tied[0]
+    winner = max(tied, key=lambda trial: _gain(trial, simplest))
+    others = [trial for trial in tied if trial is not winner]
     label, options = winner.candidate.label, winner.candidate.options
     failed = [trial.candidate.label for trial in trials if trial.reason]
     equal = [trial.candidate.label for trial in others if trial.candidate.complexity == winner.candidate.complexity]
@@ -288,6 +308,13 @@ def _choose(trials: Sequence[Trial]) -> tuple[Candidate, str]:
         sentences.append(f"{label} is the only one that could be refined, which says little for it.")
     elif not others:
         sentences.append(f"{label} predicts best what was held out.")
+    if winner is not simplest:
+        more = winner.candidate.complexity - simplest.candidate.complexity
+        sentences.append(
+            f"{simplest.candidate.label} predicts as well as {label} and is simpler, but with waves that is not all: "
+            f"what was seen is more probable with the latter (log likelihood higher by "
+            f"{_gain(winner, simplest) + more:.0f}, for {more:.4g} more unknowns)."
+        )
     if freer:
         sentences.append(f"{label} predicts as well as {', '.join(freer)}, and is simpler.")
     if equal:

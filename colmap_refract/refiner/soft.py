@@ -141,6 +141,8 @@ class SoftSolution:
         statistics, level: of waves and planes, in the end.
         adjustment: the last.
         solved: what it solved, at its solution: the waves' effects as they stood.
+        log_likelihood: log probability of the observations before any were filtered, averaged over the waves, at the
+            best of all other unknowns; up to a constant that is that of the observations.
     """
 
     wavy: Wavy
@@ -148,6 +150,7 @@ class SoftSolution:
     level: LevelPrior | None
     adjustment: Adjustment
     solved: Problem
+    log_likelihood: float
 
 
 def level_start(arrangement: Arrangement, ratio: float = _START_RATIO) -> Problem:
@@ -532,8 +535,9 @@ def _last_solves(
     if found.moved > _UNSETTLED:
         raise Unsupported("Waves are not determined: solutions with them do not settle")
     return SoftSolution(
-        wavy=found.wavy, statistics=found.statistics, level=level, adjustment=found.adjustment, solved=found.solved
-    )
+        wavy=found.wavy, statistics=found.statistics, level=level, adjustment=found.adjustment, solved=found.solved,
+        log_likelihood=_evidence(solver, found),
+    )  # fmt: skip
 
 
 def go_on(
@@ -553,7 +557,8 @@ def go_on(
         options, settings, watch: as for `solve_soft`.
     """
     solver = _Solver(_part(start, keep), options, settings, watch)
-    return _last_solves(solver, _part(soft.wavy.problem, keep), soft.statistics, soft.level)
+    last = _last_solves(solver, _part(soft.wavy.problem, keep), soft.statistics, soft.level)
+    return replace(last, log_likelihood=soft.log_likelihood)
 
 
 def filter_waves(arrangement: Arrangement, problem: Problem, noise: float) -> Filtered:

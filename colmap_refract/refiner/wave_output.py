@@ -62,6 +62,7 @@ def add_waves(
         "slope_deviation_deg": given.wave_slope_deg or float(np.degrees(np.arctan(total))),
         "explained": soft.wavy.explained,
         "noise_px": statistics.noise,
+        "log_likelihood": soft.log_likelihood,
     }
     # Of waves that no surface takes the length is a guess.
     if given.wavelength is not None:
