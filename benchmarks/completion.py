@@ -21,19 +21,22 @@ from colmap_refract.mapping.database import read_correspondences
 from colmap_refract.mapping.retriangulation import refine_with_database
 from colmap_refract.options import RefinerOptions, Scenario
 from colmap_refract.refiner.refinement import refine
-from colmap_refract.simulation import Capture, SceneOptions, noise_bound, simulate
+from colmap_refract.simulation import Capture, SceneOptions, bayesian_bound, noise_bound, simulate
 from colmap_refract.simulation.accuracy import align
 from colmap_refract.simulation.database import write_database
 
-SCENES: tuple[tuple[Scenario, float], ...] = (
-    ("moving_interface", 5.0),
-    ("moving_interface", 8.0),
-    ("static_interface", 5.0),
-    ("camera_housing", 5.0),
+SCENES: tuple[tuple[Scenario, float, float], ...] = (
+    ("moving_interface", 5.0, 0.0),
+    ("moving_interface", 8.0, 0.0),
+    ("static_interface", 5.0, 0.0),
+    ("camera_housing", 5.0, 0.0),
+    ("moving_interface", 3.0, 1.5),
 )
+"""Tilt of the planes and slope of a swell of 1 to 2.5 m, degrees (root mean square)."""
 MOST_MORE = 1.01
 """Points after completion over the points there are."""
-BOUND_LIMIT = 1.1
+BOUND_LIMIT, WAVES_LIMIT = 1.1, 2.0
+"""RMSE over the bound; with waves of unknown statistics the bound is for a solver that knows them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,26 +106,31 @@ def main() -> int:
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     progress = ProgressLine(len(SCENES))
     rows, missed = [], []
-    for scenario, tilt in SCENES:
-        progress.step(f"{scenario}, tilts of {tilt:g} deg")
+    for scenario, tilt, slope in SCENES:
+        waves = f", swell of {slope:g} deg" if slope else ""
+        progress.step(f"{scenario}, tilts of {tilt:g} deg{waves}")
         capture = simulate(
             SceneOptions(
                 scenario=scenario,
                 num_images=arguments.num_images,
                 num_points=arguments.num_points,
                 tilt_deg=tilt,
+                wave_slope_deg=slope,
+                wavelength=(1.0, 2.5),
                 seed=arguments.seed,
             )
         )
-        options = RefinerOptions(scenario=scenario)
+        options = RefinerOptions(scenario=scenario, interface_shape="soft" if slope else "plane")
         with tempfile.TemporaryDirectory() as folder:
             model, database = mapped(capture, Path(folder), arguments.wrong)
             matches = read_correspondences(database, verified=False)
         before = tracks_of(model, capture)
         alone = tracks_of(refine(model, options).reconstruction, capture)
         after = tracks_of(refine_with_database(model, options, matches).reconstruction, capture)
-        bound, there = noise_bound(capture), capture.reconstruction.num_points3D()
-        name = f"`{scenario}`, tilts of {tilt:g} deg"
+        bound = bayesian_bound(capture) if slope else noise_bound(capture)
+        there = capture.reconstruction.num_points3D()
+        name = f"`{scenario}`, tilts of {tilt:g} deg{waves}"
+        limit = WAVES_LIMIT if slope else BOUND_LIMIT
         rows.append(
             [
                 name, f"{model.num_reg_images()} / {arguments.num_images}", str(there),
@@ -134,8 +142,8 @@ def main() -> int:
         )  # fmt: skip
         if after.num_points > MOST_MORE * there:
             missed.append(f"{name}: {after.num_points} points where there are {there}")
-        if after.rmse > BOUND_LIMIT * bound:
-            missed.append(f"{name}: RMSE {after.rmse / bound:.2f} x the bound, {BOUND_LIMIT:g} is the limit")
+        if after.rmse > limit * bound:
+            missed.append(f"{name}: RMSE {after.rmse / bound:.2f} x the bound, {limit:g} is the limit")
     progress.clear()
     header = [
         "scenario", "registered", "points there are", "COLMAP's", "after", "observations there are", "COLMAP's",

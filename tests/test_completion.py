@@ -130,6 +130,34 @@ def test_damaged_tracks_come_back(scenario: Scenario, wrong: float) -> None:
         assert point_rmse(again, capture) < 1.1 * max(point_rmse(untouched, capture), noise_bound(capture))
 
 
+def test_tracks_come_back_through_waves() -> None:
+    """Each keypoint's ray is that of its image's surface; with planes in place of the surfaces most do not meet.
+
+    Only the first round: points of split tracks that are merged say more of the surfaces in the next.
+    """
+    capture = simulate(
+        SceneOptions(
+            scenario="static_interface", num_images=10, num_points=200, wave_slope_deg=1.5, wavelength=(1.0, 2.5)
+        )
+    )
+    whole = ignore_refraction(capture)
+    model = damage(whole)
+    options = RefinerOptions(scenario="static_interface", interface_shape="soft")
+    result = refine(model, options)
+    surfaces = result.sidecar
+    assert all(image.surface is not None for image in surfaces.images.values())
+    planes = replace(surfaces, images={name: replace(one, surface=None) for name, one in surfaces.images.items()})
+    matches = matches_of(capture, 0.1)
+    parts = {}
+    for key, sidecar in (("surfaces", surfaces), ("planes", planes)):
+        again, gain = complete_model(result.reconstruction, sidecar, matches, options)
+        parts[key] = partition(again, capture), again.compute_num_observations(), gain
+    (_, split, foreign), count, gain = parts["surfaces"]
+    assert split <= 2 and foreign <= 0.001 * whole.compute_num_observations()
+    assert count >= 0.97 * whole.compute_num_observations() and gain.num_merged > 20
+    assert parts["planes"][0][1] > 10 * max(split, 1) and parts["planes"][2].num_merged < 0.5 * gain.num_merged
+
+
 def test_a_whole_model_is_left_alone() -> None:
     capture = capture_of("static_interface")
     model = ignore_refraction(capture)

@@ -27,9 +27,11 @@ class Views:
         keypoints: observations of one pseudo-point: every keypoint that takes part, in the model's units.
         earlier: the interfaces, of the same model.
         unit: model units per unit of the points here; about their depth, which the points' solver expects to be one.
+        wavy: whether a keypoint is refracted by the tangent plane of its image's surface, where there is one and its
+            ray meets it. Else by the image's plane.
     """
 
-    def __init__(self, keypoints: Observations, earlier: Sidecar, unit: float) -> None:
+    def __init__(self, keypoints: Observations, earlier: Sidecar, unit: float, *, wavy: bool = False) -> None:
         count = len(keypoints.image_ids)
         rotation, translation = keypoints.cam_from_world
         normal, distance = np.tile([0.0, 0.0, 1.0], (count, 1)), np.ones(count)
@@ -38,6 +40,9 @@ class Views:
             image = earlier.images.get(name)
             if image is not None and image.normal_in_cam is not None and image.distance is not None:
                 normal[i], distance[i], plane[i] = image.normal_in_cam, image.distance / unit, i
+        axes, self._relief = np.zeros((count, 3, 2)), np.zeros((0, 3))
+        if wavy and any(image.surface is not None for image in earlier.images.values()):
+            axes, self._relief = _relief(keypoints, earlier)
         self.keypoints = keypoints
         self.structure = Structure(
             image_pose=np.arange(count),
@@ -47,6 +52,7 @@ class Views:
             sensor_translation=np.zeros((count, 3)),
             plane_in_world=np.zeros(count, dtype=np.bool_),
             plane_anchor=np.zeros((count, 3)),
+            wave_axes=axes,
         )
         self.state = State(
             rotation=rotation,
@@ -66,7 +72,7 @@ class Views:
 
     def problem(self, start: Index, keypoint: Index, points: Array) -> Problem:
         """Points whose tracks are runs of `keypoint` between entries of `start`; all seen through the water."""
-        chosen = self.keypoints
+        chosen, relief = self.keypoints, self._relief
         image = chosen.image[keypoint]
         return Problem(
             tracks=Tracks(
@@ -76,6 +82,8 @@ class Views:
                 metric=chosen.metric[keypoint],
                 lens=np.zeros((len(keypoint), 2, 0)),
                 wet=self.structure.image_plane[image] >= 0,
+                sight=chosen.direction[keypoint] if len(relief) else np.zeros((0, 3)),
+                relief=relief[keypoint] if len(relief) else relief,
             ),
             structure=self.structure,
             layers=self.layers,
@@ -127,6 +135,24 @@ class Views:
         """Largest angle (P,), degrees, between the rays of each point."""
         problem = _on_the_right_side(self.problem(start, keypoint, points))
         return triangulation_angles(problem.tracks, self.structure, self.state, self.layers, points)
+
+
+def _relief(keypoints: Observations, earlier: Sidecar) -> tuple[Array, Array]:
+    """Axes (I, 3, 2) of the images' surfaces, and `Tracks.relief` (K, 3) where the keypoints' rays meet them."""
+    axes, relief = np.zeros((len(keypoints.image_ids), 3, 2)), np.zeros((len(keypoints.image), 3))
+    for i, name in enumerate(keypoints.image_names):
+        image = earlier.images.get(name)
+        if image is None or image.surface is None or image.normal_in_cam is None or image.distance is None:
+            continue
+        mine = np.flatnonzero(keypoints.image == i)
+        ray, normal = keypoints.direction[mine], np.array(image.normal_in_cam)
+        local, distance = image.surface.local_planes(ray, normal, image.distance)
+        axes[i] = image.surface.axes
+        along = np.einsum("ni,ni->n", local, ray)
+        height = distance / along * (ray @ normal) / image.distance - 1.0
+        found = np.column_stack([height, local @ axes[i] / (local @ normal)[:, None]])
+        relief[mine] = np.where(np.isfinite(found).all(axis=1)[:, None], found, 0.0)
+    return axes, relief
 
 
 def _on_the_right_side(problem: Problem) -> Problem:

@@ -153,7 +153,7 @@ def complete_model(
     observations = read_observations(model)
     keypoints, row_of = _all_keypoints(observations, correspondences)
     unit = float(np.median(image_depths(observations)))
-    views = Views(keypoints, earlier, unit)
+    views = Views(keypoints, earlier, unit, wavy=True)
     label = np.full(len(keypoints.image), -1)
     mine = row_of(observations.image, observations.point2D_idx)
     label[mine[mine >= 0]] = observations.point[mine >= 0]
