@@ -18,6 +18,7 @@ import pytest
 
 from colmap_refract.cli import main
 from colmap_refract.errors import RefractError
+from colmap_refract.mapping import completion
 from colmap_refract.mapping.database import Correspondences
 from colmap_refract.mapping.retriangulation import complete_model, refine_with_database
 from colmap_refract.options import RefinerOptions, Scenario
@@ -128,6 +129,25 @@ def test_damaged_tracks_come_back(scenario: Scenario, wrong: float) -> None:
         # As good as if nothing had happened; `point_rmse` speaks of the ids that both models have.
         untouched = refine(whole, RefinerOptions(scenario=scenario)).reconstruction
         assert point_rmse(again, capture) < 1.1 * max(point_rmse(untouched, capture), noise_bound(capture))
+
+
+def test_new_tracks_that_never_agree_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Planes are off, so that two rays meet where all of a track's do not; with a single round none can be left out."""
+    capture = capture_of("moving_interface")
+    whole = ignore_refraction(capture)
+    options = RefinerOptions(scenario="moving_interface")
+    result, matches = refine(damage(whole), options), matches_of(capture, 0.0)
+    rng = np.random.default_rng(0)
+    off = {
+        name: replace(one, distance=(one.distance or 0.0) * (1 + 0.05 * rng.standard_normal()))
+        for name, one in result.sidecar.images.items()
+    }
+    created, usual = {}, completion._ROUNDS
+    for rounds in (usual, 1):
+        monkeypatch.setattr(completion, "_ROUNDS", rounds)
+        _, gain = complete_model(result.reconstruction, replace(result.sidecar, images=off), matches, options)
+        created[rounds] = gain.num_created
+    assert created[1] < created[usual]
 
 
 def test_tracks_come_back_through_waves() -> None:

@@ -222,8 +222,9 @@ def _create(views: Views, label: Index, points: Array, matches: Index, limits: L
     degree = np.bincount(free.ravel(), minlength=count)[keypoint]
     keypoint = keypoint[_best(-degree, np.ones(len(keypoint), np.bool_), (_pair(component, views.image, keypoint),))]
     keypoint = keypoint[np.argsort(component[keypoint], kind="stable")]
+    wrong = np.zeros(len(keypoint), dtype=np.bool_)
     for _ in range(_ROUNDS):
-        keypoint, start = _long_runs(component, keypoint, limits.min_track_length)
+        keypoint, start = _long_runs(component, keypoint[~wrong], limits.min_track_length)
         if not len(keypoint):
             return label, points, 0
         found, error = views.triangulated(start, keypoint, settle=True)
@@ -232,7 +233,6 @@ def _create(views: Views, label: Index, points: Array, matches: Index, limits: L
         wrong = (error >= limits.max_reproj_error) & (error >= worst)
         if not wrong.any():
             break
-        keypoint = keypoint[~wrong]
     else:
         good = np.maximum.reduceat(error, start[:-1]) < limits.max_reproj_error
         keypoint, start = _long_runs(component, keypoint[np.repeat(good, np.diff(start))], limits.min_track_length)
