@@ -12,11 +12,13 @@ from colmap_refract.estimator.chunk import Problem
 from colmap_refract.interface import Array
 from colmap_refract.refiner.arrangement import Arrangement
 from colmap_refract.refiner.diagnosis import SpatialCorrelation
-from colmap_refract.refiner.filtering import label_wet
+from colmap_refract.refiner.filtering import in_cameras, label_wet
 from colmap_refract.refiner.uncertainty import Uncertainty
 
 _NORMAL_LIMIT_DEG = 2.0
 _DISTANCE_LIMIT = 0.1
+_POINT_LIMIT = 0.02
+"""Of the median depth: shapes are hardly seen through so much."""
 _CORRELATION_LIMIT = 0.95
 _DECREMENT_LIMIT = 1e-4
 _STUCK = 1e-2
@@ -51,7 +53,15 @@ def has_converged(adjustment: Adjustment, uncertainty: Uncertainty) -> bool:
 
 def advise(facts: Facts) -> list[str]:
     """Sentences for the user, the gravest first; none where all is well."""
-    return [*_solver(facts), *_images(facts), *_planes(facts), *_index(facts), *_water(facts), *_waves(facts)]
+    return [
+        *_solver(facts),
+        *_images(facts),
+        *_points(facts),
+        *_planes(facts),
+        *_index(facts),
+        *_water(facts),
+        *_waves(facts),
+    ]
 
 
 def _waves(facts: Facts) -> list[str]:
@@ -192,6 +202,18 @@ def _planes(facts: Facts) -> list[str]:
             "--refine_interface_distance 0)."
         )
     return sentences
+
+
+def _points(facts: Facts) -> list[str]:
+    """If the points themselves are mostly noise: through ripples above a fixed camera, for one."""
+    points, *_ = in_cameras(facts.problem)
+    deviation = facts.uncertainty.points * facts.noise / float(np.median(points[:, 2]))
+    if not deviation > _POINT_LIMIT:
+        return []
+    return [
+        f"Half of the points are uncertain by {100 * deviation:.2g} % of their depth or more along one axis, even if "
+        f"cameras and interfaces are right: do not trust their shape; {_remedy(facts)}."
+    ]
 
 
 def _how_many(loose: NDArray[np.int64], problem: Problem) -> str:

@@ -144,6 +144,8 @@ def refine(
     if correlation is not None:
         sidecar.statistics["spatial_correlation"] = correlation.value
         sidecar.statistics["spatial_correlation_std"] = correlation.deviation
+    if np.isfinite(solution.uncertainty.points):
+        sidecar.statistics["median_point_std"] = solution.uncertainty.points * noise * to_output.scale
     if solution.describe is not None:
         solution.describe(sidecar, to_output.scale)
     seconds = (solve_seconds, perf_counter() - started)

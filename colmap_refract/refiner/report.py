@@ -73,6 +73,10 @@ def _model(sidecar: Sidecar) -> list[str]:
         _row("Median reprojection error", _errors(s, "median")),
         _row("Keypoint noise, 1 sigma per axis", f"{_number(s.get('noise'))} px" + _how_known(s)),
     ]
+    if s.get("median_point_std") is not None:
+        unit = "m" if sidecar.units.get("distance") == "metre" else "model units"
+        deviation = f"{_number(s['median_point_std'])} {unit} (median, cameras and interfaces held)"
+        lines.append(_row("Points, 1 sigma, worst axis", deviation))
     reference = s.get("reference")
     if reference:
         lines += [

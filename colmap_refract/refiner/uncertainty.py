@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.linalg import null_space
 from scipy.sparse.linalg import splu
 
+from colmap_refract.estimator import elimination
 from colmap_refract.estimator.adjustment import SolverSettings, settle_points
 from colmap_refract.estimator.banded import factorize
 from colmap_refract.estimator.chunk import Problem, change_of, slot_width
@@ -29,6 +30,8 @@ from colmap_refract.refiner.normal_equations import Key, normal_equations
 
 _STEP = 1e-4
 """Radians, or of the median depth: small against what moves a point by much, large against how well it is settled."""
+_POINT_STEP = 1e-6
+"""Of the scene's radius: residuals are nearly linear in a point."""
 _GAUGE_JITTER = 1e-10
 """Of the scaled diagonal."""
 _FOLLOWED_POINTS = 200
@@ -47,6 +50,8 @@ class Uncertainty:
         index_correlation: largest correlation of the index with the planes.
         decrement: what Newton's method would still gain, over the cost: a measure of convergence without units.
         determined: whether the system has full rank but for the gauge.
+        points: median over the points of the deviation along the axis that is known the least, units of the solve,
+            with all other unknowns held: what keypoints, and slopes that no surface takes, do to single points.
     """
 
     normal: Array
@@ -55,6 +60,7 @@ class Uncertainty:
     index_correlation: float
     decrement: float
     determined: bool
+    points: float = np.nan
 
 
 def gauge(problem: Problem, keys: list[Key], columns: dict[Key, int], num_columns: int) -> Array:
@@ -165,8 +171,9 @@ def estimate_uncertainty(problem: Problem, num_threads: int = 1) -> Uncertainty:
     num_planes = len(problem.state.normal)
     nan = np.full(num_planes, np.nan)
     unknown = Uncertainty(
-        normal=nan, distance=nan.copy(), index=np.nan, index_correlation=np.nan, decrement=0.0, determined=False
-    )
+        normal=nan, distance=nan.copy(), index=np.nan, index_correlation=np.nan, decrement=0.0, determined=False,
+        points=_of_points(problem),
+    )  # fmt: skip
     if problem.num_waves:
         return _with_waves(problem, unknown, num_threads)
     system = normal_equations(problem)
@@ -238,10 +245,32 @@ def estimate_uncertainty(problem: Problem, num_threads: int = 1) -> Uncertainty:
             with np.errstate(invalid="ignore"):
                 related = np.abs(column[:, 0]) / (index * np.sqrt(plane_variances[: len(free)]))
             correlation = float(np.nanmax(related)) if np.isfinite(related).any() else np.nan
-    return Uncertainty(
-        normal=normal, distance=distance, index=index, index_correlation=correlation,
+    return replace(
+        unknown, normal=normal, distance=distance, index=index, index_correlation=correlation,
         decrement=abs(decrement), determined=determined,
     )  # fmt: skip
+
+
+def _of_points(problem: Problem) -> float:
+    """`Uncertainty.points`, by central differences of the residuals."""
+    count, of_point = len(problem.tracks.image), problem.tracks.start[:-1]
+    views, optics = problem.views, problem.optics
+    by_axis = np.empty((count, 2, 3))
+    size = _POINT_STEP * float(np.median(np.linalg.norm(problem.points - problem.points.mean(axis=0), axis=1)))
+    for axis in range(3):
+        moved = np.empty((2, count, 2))
+        for side, step in enumerate((size, -size)):
+            points = problem.points.copy()
+            points[:, axis] += step
+            elimination.residuals(points, problem.tracks, views, optics, moved[side])
+        by_axis[:, :, axis] = (moved[0] - moved[1]) / (2.0 * size)
+    information = np.add.reduceat(np.einsum("nai,naj->nij", by_axis, by_axis), of_point)
+    information = information[np.isfinite(information).all(axis=(1, 2))]
+    if not len(information):
+        return float("nan")
+    least = np.linalg.eigvalsh(information)[:, 0]
+    with np.errstate(divide="ignore"):
+        return float(np.median(1.0 / np.sqrt(np.maximum(least, 0.0))))
 
 
 def _with_waves(problem: Problem, unknown: Uncertainty, num_threads: int) -> Uncertainty:
