@@ -91,6 +91,11 @@ def test_refraction_that_is_there_is_believed(scenes: Scenes, scenario: Scenario
         ("static_interface", {"oblique_deg": 0.0, "focal_length": 2400.0}, ("normal of the interface", "oblique ones")),
         ("camera_housing", {"focal_length": 2500.0, "tilt_deg": 0.0}, ("distance of the interface", "--interface_")),
         ("camera_housing", {"num_points": 40}, ("distance of the interface", "few points")),
+        (
+            "fixed_camera",
+            {"num_images": 8, "num_points": 120, "tilt_deg": 1.5},
+            ("of the points", "no larger; more im"),
+        ),
     ],
 )
 def test_uncertain_planes(

@@ -212,7 +212,7 @@ def _points(facts: Facts) -> list[str]:
         return []
     return [
         f"Half of the points are uncertain by {100 * deviation:.2g} % of their depth or more along one axis, even if "
-        f"cameras and interfaces are right: do not trust their shape; {_remedy(facts)}."
+        f"cameras and interfaces are right: do not trust shapes that are no larger; {_remedy(facts)}."
     ]
 
 
