@@ -224,7 +224,7 @@ class _Solver:
         bent: bool = False,
         last: bool = False,
     ) -> Round:
-        """One round: the design at the current solution, and a solve; `bent` as for `frozen`, where that settles.
+        """One round: the design at the current solution, and a solve; `bent` as for `frozen`.
 
         While a solution is sought, and `last` is not, the level prior keeps the planes of a swell together.
         """
@@ -250,7 +250,7 @@ class _Solver:
             function_tolerance=max(self.settings.function_tolerance, _FINER),
             initial_trust_region_radius=_FAR if wide else _NEAR,
         )
-        posed = frozen(problem, bent=bent and self.bends)
+        posed = frozen(problem, bent=bent)
         adjustment = adjust(posed, quick, on_progress=named(self.watch, stage))
         finite = np.isfinite(adjustment.state.distance).all() and np.isfinite(adjustment.points).all()
         if adjustment.termination == "failure" or not finite:
@@ -421,11 +421,11 @@ def _settled(
     def solve(current: Problem | None, number: int, bent: bool) -> Round:
         return _solve_once(solver, current, statistics, level, wide=number < num_wide, bent=bent)
 
-    return _repeated(solve, current, most, _SETTLED)
+    return _repeated(solve, current, most, _SETTLED, solver.bends)
 
 
 def _repeated(
-    solve: Callable[[Problem | None, int, bool], Round], current: Problem | None, most: int, close: float
+    solve: Callable[[Problem | None, int, bool], Round], current: Problem | None, most: int, close: float, bends: bool
 ) -> Round:
     """Solve, each time with the design at the solution before, until predicted keypoints stay.
 
@@ -434,13 +434,27 @@ def _repeated(
         current: to begin with; None: no solution yet.
         most: solves.
         close: noise deviations by which keypoints still move.
+        bends: whether surfaces bend the design. Where they lead nowhere it is tried once more without.
+    """
+    found, straight = _followed(solve, current, most, close, bends)
+    if found.moved > _UNSETTLED and straight is not None:
+        found = min(found, _followed(solve, straight, most, close, False)[0], key=lambda one: one.moved)
+    return found
+
+
+def _followed(
+    solve: Callable[[Problem | None, int, bool], Round], current: Problem | None, most: int, close: float, bends: bool
+) -> tuple[Round, Problem | None]:
+    """What `_repeated` comes to, and the solution from which the design was bent for the first time.
 
     Along what is hardly determined a design that is taken too far makes the next one come back too far: how much of
     a step to go follows from two of them (Aitken's relaxation: Irons and Tuck 1969).
     """
-    share, last, bent = 1.0, None, False
+    share, last, bent, straight = 1.0, None, False, None
     for number in range(most):
         before = current
+        if bent and straight is None:
+            straight = before
         found = solve(before, number, bent)
         current = found.wavy.problem
         if before is None:
@@ -449,13 +463,13 @@ def _repeated(
         if found.moved < close:
             break
         # Until then surfaces may be any.
-        bent = found.moved < _HOPELESS
+        bent = bends and found.moved < _HOPELESS
         move = _move(before, current)
         if last is not None:
             turned = move - last
             share = float(np.clip(-share * np.vdot(last, turned) / np.vdot(turned, turned), _SHORTEST_STEP, 1.0))
         current, last = between(before, current, share) if share < 1.0 else current, move
-    return found
+    return found, straight
 
 
 def _is_solution(found: Round) -> bool:
@@ -525,12 +539,9 @@ def _last_solves(
             wide=number == 0, bent=bent, last=True,
         )  # fmt: skip
 
-    def at_planes(current: Problem | None, number: int, _: bool) -> Round:
-        return solve(current, number, False)
-
-    found = _repeated(solve, current, _MOST_LAST, _CLOSE)
+    found = _repeated(solve, current, _MOST_LAST, _CLOSE, solver.bends)
     if solver.bends and solver.resolves(statistics):
-        flat = _repeated(at_planes, found.wavy.problem, _MOST_LAST, _CLOSE)
+        flat = _repeated(solve, found.wavy.problem, _MOST_LAST, _CLOSE, False)
         found = max(found, flat, key=lambda one: (one.moved <= _UNSETTLED, _evidence(solver, one)))
     if found.moved > _UNSETTLED:
         raise Unsupported("Waves are not determined: solutions with them do not settle")
