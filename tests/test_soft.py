@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -481,3 +482,26 @@ def test_auto_is_not_refined(scenes: Scenes) -> None:
     scene = scenes("static_interface", **SMALL)
     call: Callable[[], object] = lambda: scene.refine(interface_shape="auto")  # noqa: E731
     assert "choose_scenario" in error_of(call)
+
+
+def test_a_design_that_leads_nowhere_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bent by surfaces, solutions move ever farther; from where that began, those at the planes settle."""
+    begun: list[tuple[int, bool]] = []
+
+    def solve(current: Any, number: int, bent: bool) -> soft_module.Round:
+        at = (current or 0) + (10 if bent else 1)
+        begun.append((at, bent))
+        wavy: Any = SimpleNamespace(problem=at)
+        return soft_module.Round(wavy=wavy, solved=at, adjustment=at, statistics=at, level=None)  # type: ignore[arg-type]
+
+    def change(before: Any, after: Any) -> float:
+        return 9.0 if after > 10 else 0.5 / after
+
+    monkeypatch.setattr(soft_module, "_change", change)
+    monkeypatch.setattr(soft_module, "_move", lambda before, after: np.array([1.0 / after]))
+    monkeypatch.setattr(soft_module, "between", lambda before, after, share: after)
+    found = soft_module._repeated(solve, None, 4, 0.01, True)
+    assert begun[:3] == [(1, False), (2, False), (12, True)]
+    assert found.solved == begun[-1][0] == 6 and not begun[-1][1] and found.moved < 0.1
+    begun.clear()
+    assert soft_module._repeated(solve, None, 4, 0.01, False).solved == 4 and len(begun) == 4
