@@ -74,8 +74,7 @@ def _model(sidecar: Sidecar) -> list[str]:
         _row("Keypoint noise, 1 sigma per axis", f"{_number(s.get('noise'))} px" + _how_known(s)),
     ]
     if s.get("median_point_std") is not None:
-        unit = "m" if sidecar.units.get("distance") == "metre" else "model units"
-        deviation = f"{_number(s['median_point_std'])} {unit} (median, cameras and interfaces held)"
+        deviation = f"{_number(s['median_point_std'])} {_unit(sidecar)} (median, cameras and interfaces held)"
         lines.append(_row("Points, 1 sigma, worst axis", deviation))
     reference = s.get("reference")
     if reference:
@@ -87,6 +86,11 @@ def _model(sidecar: Sidecar) -> list[str]:
             _row("Other points, placed afterwards", str(reference.get("num_points_placed"))),
         ]
     return lines
+
+
+def _unit(sidecar: Sidecar) -> str:
+    """Of lengths in the model."""
+    return "m" if sidecar.units.get("distance") == "metre" else "model units"
 
 
 def _how_known(statistics: dict[str, Any]) -> str:
@@ -107,8 +111,7 @@ def _interfaces(sidecar: Sidecar) -> list[str]:
             num_dry += 1
         else:
             groups.setdefault(image.group or name, []).append(image)
-    metric = sidecar.units.get("distance") == "metre"
-    unit = "m" if metric else "model units"
+    unit = _unit(sidecar)
     head = f"{'Interface':28s}{'images':>7s}  {'distance [' + unit + ']':28s}tilt [deg]"
     lines = [head, "-" * _WIDTH]
     for group, images in list(groups.items())[:_MOST_ROWS]:
@@ -131,7 +134,7 @@ def _interfaces(sidecar: Sidecar) -> list[str]:
     lines.append(_row("Refractive index", index + (f" +- {_number(deviation)}" if deviation else " (held)")))
     if media:
         lines.append(_row("Walls", media))
-    if metric:
+    if unit == "m":
         lines.append(_row("Size", "metres, from interface_distance" + _scale_worth(sidecar)))
     return lines
 
@@ -140,7 +143,7 @@ def _waves(sidecar: Sidecar) -> list[str]:
     waves = sidecar.statistics.get("waves")
     if not waves:
         return []
-    unit = "m" if sidecar.units.get("distance") == "metre" else "model units"
+    unit = _unit(sidecar)
     if waves.get("num_normals"):
         return [
             _row("Waves", f"{waves['num_normals']} normals, one per observation; the planes are their means"),
